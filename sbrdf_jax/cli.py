@@ -1,0 +1,85 @@
+"""The command line: `sbrdf VERB ...`, the same verbs as `python -m sbrdf_jax.VERB ...`.
+
+Exit codes: 0 done, 1 an unexpected error, 2 the config or the input is wrong, 3 finished
+but some lanes failed, 130 interrupted, 143 terminated.
+"""
+
+import argparse
+import importlib
+import os
+import signal
+import sys
+from collections.abc import Sequence
+
+from sbrdf_jax.errors import UserError
+
+UNEXPECTED, WRONG_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
+
+COMMANDS = {
+    "run": "from a measurement to a result, as a config says",
+    "evaluate": "values of a result at given directions",
+    "inspect": "what a measurement or a result is",
+    "sample": "write the embedded sample as a raw file",
+    "report": "figures and a page of one or more results",
+    "schema": "JSON schema of the config, for editors",
+}
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str):
+        self.exit(WRONG_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run one command line and return its exit code."""
+    if not argv or argv[0] in ("-h", "--help"):
+        print(_overview())
+        return 0 if argv else WRONG_INPUT
+    verb, rest = argv[0], argv[1:]
+    if verb not in COMMANDS:
+        print(f"sbrdf: unknown command {verb!r}; it is one of {', '.join(COMMANDS)}", file=sys.stderr)
+        return WRONG_INPUT
+    command = importlib.import_module(f"sbrdf_jax.commands.{verb}")
+    parser = _Parser(
+        prog=f"sbrdf {verb}",
+        description=command.SUMMARY,
+        epilog=command.EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    command.add_arguments(parser)
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        return command.run(parser.parse_intermixed_args(rest))
+    except UserError as error:
+        print(f"sbrdf {verb}: {error}", file=sys.stderr)
+        return WRONG_INPUT
+    except KeyboardInterrupt:
+        print(f"sbrdf {verb}: interrupted; nothing was written under the output name", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # the reader of our output went away: `sbrdf ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return UNEXPECTED
+    except Exception as error:
+        print(f"sbrdf {verb}: unexpected {type(error).__name__}: {first_line(error)}", file=sys.stderr)
+        return UNEXPECTED
+
+
+def main_exit() -> None:
+    """Entry point of the console script."""
+    raise SystemExit(main(sys.argv[1:]))
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's text."""
+    return (str(error).splitlines() or [""])[0]
+
+
+def _overview() -> str:
+    rows = "\n".join(f"  {name:<10} {summary}" for name, summary in COMMANDS.items())
+    return f"usage: sbrdf COMMAND ...\n\n{rows}\n\nsbrdf COMMAND --help shows an example."
+
+
+def _terminate(_signum, _frame):
+    raise SystemExit(TERMINATED)

@@ -1,0 +1,1 @@
+"""One file a verb of the command line: its arguments in, its exit code out."""

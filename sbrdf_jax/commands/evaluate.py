@@ -1,0 +1,149 @@
+"""`sbrdf evaluate`: values of a result at given directions, CSV in and CSV out."""
+
+import argparse
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+SUMMARY = "values of a result [1/sr] at the directions of a CSV file"
+EXAMPLE = """\
+example:
+  sbrdf evaluate results/quickstart.h5 --at directions.csv --stage compact --output values.csv
+
+directions.csv:
+  theta_i_deg,theta_o_deg,phi_o_deg
+  30,30,180
+"""
+
+COLUMNS = ("theta_i_deg", "theta_o_deg", "phi_o_deg")
+ROWS_AT_A_TIME = 8192
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    parser.add_argument("result", metavar="RESULT.h5", help="a result of sbrdf run")
+    parser.add_argument("--at", required=True, metavar="DIRECTIONS.csv", help=f"directions, header {','.join(COLUMNS)}")
+    parser.add_argument("--stage", required=True, choices=("grid", "compact"), help="which form of the result")
+    parser.add_argument("--output", required=True, metavar="VALUES.csv", help="the file to write")
+    parser.add_argument("--wavelengths", metavar="NM,NM,...", help="in the measured range; if absent, those measured")
+    parser.add_argument("--uncertainty", action="store_true", help="add a standard error beside each value")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the values; exit code 0."""
+    from sbrdf_jax.errors import UserError
+    from sbrdf_jax.runtime import set_up_jax
+
+    set_up_jax()
+    import numpy as np
+
+    from sbrdf_jax.evaluation import evaluate_in_chunks, measured_wavelengths
+    from sbrdf_jax.files import whole_file
+    from sbrdf_jax.store import load_stage
+
+    stage = load_stage(args.result, args.stage)
+    if args.uncertainty:
+        raise UserError(f"--uncertainty: the {args.stage} stage of {args.result} has no standard errors")
+    measured = np.asarray(measured_wavelengths(stage))
+    wanted = None if args.wavelengths is None else parse_wavelengths(args.wavelengths, measured)
+    texts, angles = read_directions(Path(args.at))
+    output = Path(args.output)
+    for source in (args.at, args.result):
+        if output.exists() and output.samefile(source):
+            raise UserError(f"--output: {args.output} is also read, expected another file")
+
+    names = wavelength_names(measured if wanted is None else wanted)
+    radians = np.deg2rad(np.asarray(angles, float).reshape(-1, 3))
+    with whole_file(output) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
+        file.write(",".join([*COLUMNS, *names]) + "\n")
+        for start in range(0, len(texts), ROWS_AT_A_TIME):
+            part = radians[start : start + ROWS_AT_A_TIME]
+            value = evaluate_in_chunks(stage, *part.T, wanted)
+            for text, row in zip(texts[start : start + ROWS_AT_A_TIME], value.tolist(), strict=True):
+                file.write(",".join([*text, *map(repr, row)]) + "\n")
+    print(f"{output}: {len(texts)} directions x {len(names)} wavelengths, {args.stage} stage")
+    return 0
+
+
+def read_directions(path: Path) -> tuple[list[list[str]], list[list[float]]]:
+    """Read directions as written and as numbers [deg].
+
+    Args:
+        path: CSV with the header `theta_i_deg,theta_o_deg,phi_o_deg`; `#` comments and empty lines are skipped.
+
+    Returns:
+        The three columns of each row, as text and as numbers.
+
+    Raises:
+        UserError: a bad header, or a row that is no direction above the horizon; it is named by line and by row from 0.
+    """
+    from sbrdf_jax.errors import UserError
+    from sbrdf_jax.formats.text import shorten
+
+    if not path.is_file():
+        raise UserError(f"{path}: no such file, expected directions as CSV")
+    texts, angles, header = [], [], False
+    for number, words in _rows(path):
+        if not header:
+            if tuple(words) != COLUMNS:
+                found = shorten(",".join(words))
+                raise UserError(f"{path}:{number}: header: found {found}, expected {','.join(COLUMNS)}")
+            header = True
+            continue
+        where = f"{path}:{number}: row {len(texts)}"
+        if len(words) != len(COLUMNS):
+            raise UserError(f"{where}: found {len(words)} columns, expected {len(COLUMNS)}")
+        angles.append([_angle(where, *pair) for pair in zip(COLUMNS, words, strict=True)])
+        texts.append(words)
+    if not header:
+        raise UserError(f"{path}: found no header, expected {','.join(COLUMNS)}")
+    return texts, angles
+
+
+def parse_wavelengths(text: str, measured) -> list[float]:
+    """Parse `--wavelengths` [nm].
+
+    Raises:
+        UserError: not numbers, or outside the measured range.
+    """
+    from sbrdf_jax.errors import UserError
+
+    low, high = float(measured[0]), float(measured[-1])
+    try:
+        wanted = [float(word) for word in text.split(",")]
+    except ValueError:
+        raise UserError(f"--wavelengths: found {text!r}, expected numbers [nm] parted by commas") from None
+    for wavelength in wanted:
+        if not low <= wavelength <= high:
+            raise UserError(f"--wavelengths: found {wavelength:g}, expected {low:g} to {high:g} nm, as measured")
+    return wanted
+
+
+def wavelength_names(wavelength_nm) -> list[str]:
+    """Column names, `552nm`; in full where six digits do not tell two wavelengths apart."""
+    short = [f"{w:g}nm" for w in wavelength_nm]
+    return short if len(set(short)) == len(short) else [f"{float(w)!r}nm" for w in wavelength_nm]
+
+
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    from sbrdf_jax.formats.text import numbered_lines
+
+    for number, text in numbered_lines(path):
+        if text.strip() and not text.lstrip().startswith("#"):
+            yield number, [word.strip() for word in text.split(",")]
+
+
+def _angle(where: str, column: str, word: str) -> float:
+    from sbrdf_jax.errors import UserError
+    from sbrdf_jax.formats.text import shorten
+
+    try:
+        angle = float(word)
+    except ValueError:
+        raise UserError(f"{where}: {column}: found {shorten(word)}, expected a number") from None
+    if not math.isfinite(angle):
+        raise UserError(f"{where}: {column}: found {word}, expected a finite number")
+    if column != "phi_o_deg" and not 0 <= angle <= 90:
+        below = ", below the horizon" if angle > 90 else ""
+        raise UserError(f"{where}: {column}: found {word}{below}, expected 0 to 90")
+    return angle

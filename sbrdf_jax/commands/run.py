@@ -1,0 +1,96 @@
+"""`sbrdf run CONFIG.yaml`: from a measurement to a result, and figures beside it."""
+
+import argparse
+import dataclasses
+import sys
+import time
+import traceback
+from pathlib import Path
+
+SUMMARY = "From a measurement to a result, as a config says."
+EXAMPLE = """example:
+  sbrdf run configs/quickstart.yaml output.path=results/mine.h5 represent.max_degree=1
+
+key.path=value is read as YAML; a mapping replaces the whole block. --plan only counts the work.
+Exit codes: 0 done, 2 config or input wrong, 3 some lanes did not reach their tolerance (listed)."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("config", metavar="CONFIG.yaml", help="the config")
+    parser.add_argument("overrides", metavar="key.path=value", nargs="*", help="overrides of the config")
+    parser.add_argument("--plan", action="store_true", help="print what would be computed, and compute nothing")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run one config and return the exit code."""
+    from sbrdf_jax.config import check_output, load_config, resolve
+    from sbrdf_jax.errors import UserError
+    from sbrdf_jax.formats import read
+    from sbrdf_jax.progress import Progress
+    from sbrdf_jax.runtime import set_up_jax
+
+    start = time.perf_counter()
+    options = resolve(load_config(args.config, args.overrides))
+    if not args.plan:
+        check_output(options)
+    set_up_jax()
+    raw = read(options.input.path, options.input)
+    if args.plan:
+        from sbrdf_jax.pipeline import prepare
+        from sbrdf_jax.plan import plan_text
+
+        print(plan_text(prepare(raw, options).rows))
+        return 0
+    from sbrdf_jax.pipeline import prepare
+
+    prepare(raw, options)  # a measurement that is refused leaves no log and no folder behind
+    output = Path(options.output.path)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with Progress(output.with_name(output.name + ".log")) as progress:
+        try:
+            return _run(options, raw, progress, time.perf_counter() - start)
+        except (UserError, KeyboardInterrupt, SystemExit) as error:
+            progress.log(f"stopped: {type(error).__name__}: {error}")
+            raise
+        except Exception as error:
+            for line in traceback.format_exc().splitlines():
+                progress.log(line)
+            reason = (str(error).splitlines() or [""])[0]
+            print(f"sbrdf run: unexpected {type(error).__name__}: {reason}; see {output}.log", file=sys.stderr)
+            return 1
+
+
+def _run(options, raw, progress, set_up_seconds: float) -> int:
+    from datetime import UTC, datetime
+
+    from sbrdf_jax.config import resolved_yaml
+    from sbrdf_jax.pipeline import failed_lanes, process
+    from sbrdf_jax.runtime import versions
+    from sbrdf_jax.store import save
+    from sbrdf_jax.summary import summary_text
+
+    output = Path(options.output.path)
+    result = process(raw, options, progress)
+    timing = {"set_up": {"total": set_up_seconds, "compile": 0.0, "run": set_up_seconds}} | dict(result.timing)
+    result = dataclasses.replace(
+        result,
+        config=resolved_yaml(options),
+        created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        versions=versions(),
+        timing=timing,
+    )
+    with progress.stage("save"):
+        save(output, result)
+        progress.update(str(output))
+    if options.output.report:
+        from sbrdf_jax.report import write_page
+
+        with progress.stage("report"):
+            page = write_page([(output.stem, result)], output.with_suffix(""), raw=raw)
+            progress.update(str(page))
+    progress.say(summary_text(result))
+    failures = failed_lanes(result)
+    for line in failures:
+        progress.say(line)
+    return 3 if failures else 0

@@ -1,0 +1,286 @@
+"""A YAML config and `key.path=value` overrides to frozen option records; what autos mean; what is built.
+
+Whatever is wrong is one `UserError`: `file:line:column: key.path: what was found; expected ...`,
+or `command line: key.path=value: ...`.
+"""
+
+import dataclasses
+import hashlib
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from sbrdf_jax.errors import UserError
+from sbrdf_jax.option_checks import check_options, describe, option_at
+from sbrdf_jax.options import ErrorBudget, OutgoingOptions, RunOptions, TargetOptions
+from sbrdf_jax.yaml_tree import KeyPath, Tree, dotted, dump_yaml, parse_yaml
+
+# A row goes when its method arrives: key, which values are refused, and what there is.
+NOT_YET: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "input.format": (
+        lambda value: value in ("rgl-bsdf", "merl", "astm", "pab", "inplane", "alta"),
+        "auto, pbrt, csv, hdf5, nist",
+    ),
+    "grid.reciprocal": (lambda value: value, "false"),
+    "resample.method": (lambda value: value == "guided", "paper"),
+    "resample.smoothness_weight": (lambda value: value == "data", "auto or a number"),
+    "encode.basis": (lambda value: value == "data", "auto, fourier, cosine, identity"),
+    "represent.method": (lambda value: value in ("lobe_harmonics", "lobe_tensor"), "auto, paper"),
+    "validate.folds": (lambda value: value > 0, "0"),
+    "validate.leave_one_theta_i_out": (lambda value: value, "false"),
+    "validate.fold_file": (lambda value: value is not None, "null"),
+    "scene": (lambda value: value is not None, "null"),
+    "runtime.precision": (lambda value: value == "float32", "float64"),
+    "runtime.resume_from": (lambda value: value is not None, "null"),
+}
+
+# What auto means, by method; what is not here stays auto and is decided by the data.
+AUTO_REPRESENT_METHOD = "paper"
+AUTO_RESAMPLE: dict[str, dict[str, Any]] = {
+    "paper": {"smoothness_weight": 1.0, "tolerance": 1e-8},
+    "guided": {"smoothness_weight": "data", "tolerance": 1e-6},
+}
+AUTO_ENCODE: dict[str, dict[str, Any]] = {"paper": {"basis": "fourier", "coefficients": 19}}
+AUTO_REPRESENT: dict[str, dict[str, Any]] = {
+    "paper": {"max_degree": 4},
+    "lobe_harmonics": {"max_degree": 8},
+    "lobe_tensor": {"max_degree": 8},
+}
+
+BUILTIN = "builtin:"
+
+_INPUT_PATHS = (
+    "input.path",
+    "validate.fold_file",
+    "scene.outgoing.directions",
+    "scene.outgoing.mask",
+    "scene.footprint",
+)
+_ONE_OF = ("represent.target", "scene.outgoing", "scene.error_budget")
+_RANGES = ("scene.theta_i_deg", "scene.wavelength_nm")
+_STEPS = (("grid.theta_i_step_deg", 90), ("grid.theta_o_step_deg", 90), ("grid.phi_o_step_deg", 180))
+_MAX_BYTES = 1 << 16  # the YAML parser takes some 0.2 ms a value
+
+
+def load_config(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> RunOptions:
+    """Load a config file; autos stay (see `resolve`).
+
+    Args:
+        path: The YAML file.
+        overrides: `key.path=value` each, the value in YAML, applied in order. A mapping replaces a whole block.
+
+    Returns:
+        The options, with `input.path` and other inputs made absolute: in the file they are
+        relative to its folder, in an override to the working directory.
+
+    Raises:
+        UserError: The file or an override is wrong.
+    """
+    return parse_config(_read_text(path), overrides, name=os.fspath(path), folder=Path(path).parent)
+
+
+def parse_config(
+    text: str, overrides: Sequence[str] = (), *, name: str = "config", folder: str | os.PathLike[str] = "."
+) -> RunOptions:
+    """Parse the text of a config: `load_config` without the file, with a name for messages and a folder."""
+
+    def place(line: int, column: int, path: KeyPath) -> str:
+        return f"{name}:{line}:{column}" + (f": {dotted(path)}" if path else "")
+
+    tree = parse_yaml(text, place)
+    if not isinstance(tree.data, dict):
+        found = "an empty file" if tree.data is None else describe(tree.data)
+        raise UserError(f"{tree.values[()]}: found {found}; expected a config, a block of keys such as input.path")
+    check_options(tree, complete=False)
+    _make_absolute(tree.data, folder)
+    for override in overrides:
+        _override(tree, override)
+        check_options(tree, complete=False)
+    _make_absolute(tree.data, ".")
+    options = check_options(tree)
+    assert options is not None
+    for key, problem in _problems(options):
+        raise UserError(f"{_place_of(tree, key)}: {problem}")
+    output = dataclasses.replace(options.output, path=os.path.expanduser(options.output.path))
+    return dataclasses.replace(options, output=output)
+
+
+def resolve(options: RunOptions) -> RunOptions:
+    """Replace every auto that does not need the data by what it stands for."""
+    represent = options.represent
+    if represent.method == "auto":
+        represent = dataclasses.replace(represent, method=AUTO_REPRESENT_METHOD)
+    return dataclasses.replace(
+        options,
+        resample=_fill_autos(options.resample, AUTO_RESAMPLE[options.resample.method]),
+        encode=_fill_autos(options.encode, AUTO_ENCODE.get(represent.method, {})),
+        represent=_fill_autos(represent, AUTO_REPRESENT[represent.method]),
+    )
+
+
+def resolved_yaml(options: RunOptions) -> str:
+    """Write options as YAML with every key, as a result stores it; loading it gives equal options."""
+    return dump_yaml(_plain(options))
+
+
+def config_sha256(options: RunOptions) -> str:
+    """SHA-256 of `resolved_yaml`, in hexadecimal."""
+    return hashlib.sha256(resolved_yaml(options).encode()).hexdigest()
+
+
+def check_output(options: RunOptions) -> None:
+    """Refuse an output path that cannot be written, or that would replace a result unasked. Creates nothing.
+
+    Raises:
+        UserError: It is a folder, exists without `output.overwrite`, is the input, or its folder cannot be made.
+    """
+    path = Path(options.output.path)
+    where = f"output.path: found {str(path)!r}"
+    try:
+        if path.is_dir() or options.output.path.endswith(os.sep):
+            raise UserError(f"{where}, a folder; expected the name of a file")
+        if path.exists():
+            if not path.is_file():
+                raise UserError(f"{where}, which is no regular file; expected the name of a file")
+            if Path(options.input.path).exists() and path.samefile(options.input.path):
+                raise UserError(f"{where}, the input itself; expected another file")
+            if not options.output.overwrite:
+                raise UserError(f"{where}, which exists; expected a new file, or output.overwrite=true")
+        folder = path.absolute().parent
+        while not folder.exists():
+            folder = folder.parent
+        if not folder.is_dir():
+            raise UserError(f"{where}, but {str(folder)!r} is a file; expected a folder there")
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise UserError(f"{where}, but the folder {str(folder)!r} cannot be written; expected one that can")
+    except OSError as error:
+        raise UserError(f"{where}, which cannot be used ({error.strerror}); expected a file to write") from None
+
+
+def _read_text(path: str | os.PathLike[str]) -> str:
+    name = os.fspath(path)
+    try:
+        with open(path, "rb") as file:
+            raw = file.read(_MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise UserError(f"{name}: found no such file; expected a YAML config") from None
+    except IsADirectoryError:
+        raise UserError(f"{name}: found a folder; expected a YAML config") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"{name}: found a file that cannot be read ({reason}); expected a YAML config") from None
+    if len(raw) > _MAX_BYTES:
+        raise UserError(f"{name}: found more than {_MAX_BYTES} bytes; expected a YAML config")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw[: error.start].count(b"\n") + 1
+        column = error.start - (raw.rfind(b"\n", 0, error.start) + 1) + 1
+        found = f"found the byte 0x{raw[error.start]:02x}, which is not UTF-8"
+        raise UserError(f"{name}:{line}:{column}: {found}; expected a YAML config") from None
+
+
+def _override(tree: Tree, text: str) -> None:
+    """Apply one `key.path=value`."""
+    shown = "".join(c if c.isprintable() else " " for c in text)
+    label = f"command line: {shown[:80]}{'...' if len(shown) > 80 else ''}"
+    key, equals, value = text.partition("=")
+    path: KeyPath = tuple(part.strip() for part in key.split("."))
+    if not equals or not all(path):
+        raise UserError(f"{label}: found no {'key' if equals else '='}; expected key.path=value")
+
+    def place(line: int, column: int, inner: KeyPath) -> str:
+        return label if inner in ((), path) else f"{label}: {dotted(inner)}"
+
+    part = parse_yaml(value, place, path)
+    block = tree.data
+    for number, name in enumerate(path[:-1], start=1):
+        if not isinstance(block.get(name), dict):
+            _forget(tree, path[:number])
+            block[name] = {}
+            tree.keys[path[:number]] = tree.values[path[:number]] = place(1, 1, path[:number])
+        block = block[name]
+    _forget(tree, path)
+    block[path[-1]] = part.data
+    tree.keys[path] = label
+    tree.keys.update(part.keys)
+    tree.values.update(part.values)
+
+
+def _forget(tree: Tree, path: KeyPath) -> None:
+    """Drop the places of a value that is replaced, so that the order of places stays that of writing."""
+    for places in (tree.keys, tree.values):
+        for old in [old for old in places if old[: len(path)] == path]:
+            del places[old]
+
+
+def _make_absolute(data: dict[str, Any], folder: str | os.PathLike[str]) -> None:
+    """Make the paths of inputs absolute; those that already are, and builtin names, stay."""
+    for key in _INPUT_PATHS:
+        *parents, last = key.split(".")
+        block: Any = data
+        for part in parents:
+            block = block.get(part) if isinstance(block, dict) else None
+        value = block.get(last) if isinstance(block, dict) else None
+        if isinstance(value, str) and value and not value.startswith(BUILTIN):
+            block[last] = os.path.abspath(os.path.join(folder, os.path.expanduser(value)))
+
+
+def _place_of(tree: Tree, key: str) -> str:
+    """Beginning of a message about a key that was written; about keys that clash, the one written last."""
+    path: KeyPath = tuple(key.split("."))
+    if key in _ONE_OF + _RANGES:
+        path = [other for other in tree.values if other[: len(path)] == path][-1]
+    return tree.values[path]
+
+
+def _problems(options: RunOptions) -> Iterator[tuple[str, str]]:
+    """Find what is wrong between keys, and what is not built yet: the key and the end of the message."""
+    for key, whole in _STEPS:
+        step = option_at(options, key)
+        if abs(whole / step - round(whole / step)) > 1e-9:
+            near = min(_divisors(whole), key=lambda divisor: abs(divisor - step))
+            yield key, f"found {step:g}; expected a step that divides {whole} [deg]; did you mean {near:g}?"
+    encode = resolve(options).encode
+    if encode.basis == "fourier" and isinstance(encode.coefficients, int) and encode.coefficients % 2 == 0:
+        yield "encode.coefficients", f"found {encode.coefficients}; expected an odd number, because basis is fourier"
+    if options.validate.folds == 1:
+        yield "validate.folds", "found 1; expected 0 (off), or 2 or more"
+    for key in _ONE_OF:
+        block = _block_at(options, key)
+        given = [] if block is None else [name for name, value in vars(block).items() if value is not None]
+        if block is not None and len(given) != 1:
+            names = ", ".join(vars(block))
+            yield key, f"found {' and '.join(given) or 'none'}; expected {key} to have exactly one of {names}"
+    for key in _RANGES:
+        block = _block_at(options, key)
+        if block is not None and not isinstance(block, tuple) and not block.min < block.max:
+            yield key, f"found min {block.min:g} and max {block.max:g}; expected min below max"
+    for key, (is_refused, available) in NOT_YET.items():
+        value = option_at(options, key)
+        if is_refused(value):
+            yield key, f"found {describe(value)}, which is not available yet; expected what is: {available}"
+
+
+def _block_at(options: RunOptions, key: str) -> Any:
+    """Value of a key, None where the scene above it is null."""
+    return None if key.startswith("scene.") and options.scene is None else option_at(options, key)
+
+
+def _divisors(whole: int) -> list[float]:
+    """Steps that divide a range and that a person would write."""
+    return [whole / count for count in range(2, 10 * whole + 1) if round(whole / count, 2) == whole / count]
+
+
+def _fill_autos(record: Any, meaning: dict[str, Any]) -> Any:
+    return dataclasses.replace(record, **{key: new for key, new in meaning.items() if getattr(record, key) == "auto"})
+
+
+def _plain(value: Any) -> Any:
+    """Records and tuples as dict and list; where one of several keys is given, that one alone."""
+    if dataclasses.is_dataclass(value):
+        fields = {name: _plain(inner) for name, inner in vars(value).items()}
+        is_one_of = isinstance(value, TargetOptions | OutgoingOptions | ErrorBudget)
+        return {name: inner for name, inner in fields.items() if inner is not None} if is_one_of else fields
+    return [_plain(inner) for inner in value] if isinstance(value, tuple) else value

@@ -1,0 +1,231 @@
+"""Spectrum <-> coefficients: eqs. (11) and (12), their even extension, and the samples themselves."""
+
+import functools
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sbrdf_jax.records import GriddedBRDF, SpectralBasis, SpectralField
+
+BASIS_KINDS = ("fourier", "cosine", "identity")
+FEWEST_WAVELENGTHS = 5  # below it a series says less than the samples
+UNIFORM_TOLERANCE = 1e-6  # of the step; wavelengths closer to uniform are taken as uniform
+
+
+class AllowedBasis(NamedTuple):
+    """What a number of wavelengths can carry; `warning` is None where that is what was wanted."""
+
+    kind: str
+    coefficients: int
+    warning: str | None
+
+
+def coefficients_allowed(num_wavelengths: int, wanted: int, kind: str = "fourier") -> AllowedBasis:
+    """Return the basis and the number of real coefficients that so many wavelengths can carry.
+
+    n samples carry at most n - 1 coefficients, the largest odd number: a_0 and pairs of cosine
+    and sine below the Nyquist harmonic. Below `FEWEST_WAVELENGTHS` the samples stand for themselves.
+
+    Args:
+        num_wavelengths: Samples per spectrum.
+        wanted: Coefficients asked for; ignored by "identity".
+        kind: One of `BASIS_KINDS`.
+
+    Returns:
+        The kind and count to use, and a sentence where they are not what was asked for.
+
+    Raises:
+        ValueError: `kind` is unknown or `wanted` below 1.
+    """
+    if kind not in BASIS_KINDS:
+        raise ValueError(f"basis {kind!r}: expected one of {', '.join(BASIS_KINDS)}")
+    if kind == "identity":
+        return AllowedBasis("identity", num_wavelengths, None)
+    if wanted < 1:
+        raise ValueError(f"coefficients: found {wanted}, expected 1 or more")
+    if num_wavelengths < FEWEST_WAVELENGTHS:
+        text = f"{num_wavelengths} wavelengths are too few for a series: the samples themselves are stored"
+        return AllowedBasis("identity", num_wavelengths, text)
+    most = num_wavelengths - 1 - num_wavelengths % 2  # the largest odd number up to n - 1
+    used = min(wanted, most)
+    if kind == "fourier" and used % 2 == 0:  # a cosine without its sine has no place in eq. (11)
+        used -= 1
+    if used == wanted:
+        return AllowedBasis(kind, used, None)
+    why = f"{num_wavelengths} wavelengths carry at most {most}" if wanted > most else "their number is odd in eq. (11)"
+    return AllowedBasis(kind, used, f"{used} spectral coefficients in place of {wanted}: {why}")
+
+
+def make_basis(wavelength_nm: Float[np.ndarray, " wavelength"], kind: str, coefficients: int) -> SpectralBasis:
+    """Return the spectral basis of measured wavelengths, on the host.
+
+    Args:
+        wavelength_nm: Measured wavelengths [nm], increasing; both ends belong to the domain.
+        kind: One of `BASIS_KINDS`.
+        coefficients: Coefficients wanted; `coefficients_allowed` says how many are used, and why.
+
+    Returns:
+        The basis, with the trapezoid rule of eq. (12) as the matrix `analysis`.
+
+    Raises:
+        ValueError: wavelengths that do not increase, or what `coefficients_allowed` refuses.
+    """
+    wavelength_nm = np.asarray(wavelength_nm, np.float64)
+    step = np.diff(wavelength_nm)
+    if wavelength_nm.size == 0 or not np.all(step > 0):
+        raise ValueError("wavelength_nm: expected one wavelength or more, increasing")
+    kind, count, _ = coefficients_allowed(wavelength_nm.size, coefficients, kind)
+    if kind == "identity":
+        return SpectralBasis(wavelength_nm, np.eye(count), np.eye(count), kind, uniform=False)
+    synthesis = _series(_position(wavelength_nm, wavelength_nm), kind, count, np)
+    weight = np.convolve(step, [0.5, 0.5]) * 2 / (wavelength_nm[-1] - wavelength_nm[0])
+    analysis = weight[:, None] * synthesis.T
+    analysis[:, 0] *= 2  # the half of a_0 belongs to the synthesis
+    uniform = bool(np.ptp(step) <= UNIFORM_TOLERANCE * step.mean())
+    return SpectralBasis(wavelength_nm, analysis, synthesis, kind, uniform=uniform)
+
+
+def coefficient_names(basis: SpectralBasis) -> tuple[str, ...]:
+    """Return the name of each coefficient: a_0, a_1, b_1, ... of eq. (11), c_0, c_1, ..., or the wavelengths."""
+    count = np.shape(basis.synthesis)[0]
+    if basis.kind == "fourier":
+        return tuple(f"{'ab'[k > 0 and k % 2 == 0]}_{(k + 1) // 2}" for k in range(count))
+    if basis.kind == "cosine":
+        return tuple(f"c_{k}" for k in range(count))
+    return tuple(f"{wavelength:g}nm" for wavelength in np.asarray(basis.wavelength_nm))
+
+
+@functools.partial(jax.jit, static_argnames="coefficients")
+def encode_fft(
+    spectrum: Float[Array | np.ndarray, "*shape wavelength"], coefficients: int
+) -> Float[Array, "*shape coefficient"]:
+    """Encode uniformly spaced spectra by eq. (12), its trapezoid rule taken as an FFT.
+
+    The two ends are one point of the period: the FFT runs over the N - 1 samples whose first
+    is the mean of both ends.
+
+    Args:
+        spectrum: Values [1/sr] at uniformly spaced wavelengths, both ends included.
+        coefficients: Odd number of coefficients a_0, a_1, b_1, ..., at most N - 1.
+
+    Returns:
+        Coefficients [1/sr]; the spectrum is a_0 / 2 + sum of a_k cos + b_k sin.
+
+    Raises:
+        ValueError: an even or too large `coefficients` (raised while tracing).
+    """
+    period = spectrum.shape[-1] - 1
+    if coefficients % 2 == 0 or coefficients > period:
+        raise ValueError(f"coefficients: found {coefficients}, expected an odd number up to {period}")
+    ends = (spectrum[..., :1] + spectrum[..., -1:]) / 2
+    harmonic = jnp.fft.rfft(jnp.concatenate([ends, spectrum[..., 1:-1]], axis=-1), axis=-1)
+    harmonic = harmonic[..., : coefficients // 2 + 1] * (2 / period)
+    pairs = jnp.stack([harmonic.real, -harmonic.imag], axis=-1)
+    flat = pairs.reshape(*pairs.shape[:-2], -1)  # a_0, b_0 = 0, a_1, b_1, ...
+    return jnp.concatenate([flat[..., :1], flat[..., 2:]], axis=-1)
+
+
+@jax.jit
+def encode(
+    spectrum: Float[Array | np.ndarray, "*shape wavelength"], basis: SpectralBasis
+) -> Float[Array, "*shape coefficient"]:
+    """Return the coefficients of spectra in a basis, eq. (12).
+
+    Args:
+        spectrum: Values [1/sr] at the basis' own wavelengths.
+        basis: From `make_basis`.
+
+    Returns:
+        Coefficients [1/sr], in the order of `coefficient_names`.
+
+    Numerics:
+        Where wavelengths are uniform by an FFT, else by the trapezoid weights as a matrix. A
+        NaN spoils the coefficients of its own spectrum only.
+    """
+    count = basis.analysis.shape[1]
+    if not basis.uniform:
+        return jnp.matmul(spectrum, jnp.asarray(basis.analysis, spectrum.dtype))
+    if basis.kind == "fourier":
+        return encode_fft(spectrum, count)
+    # a cosine series is the Fourier series of the even extension: no jump at the ends, no sines
+    mirrored = jnp.concatenate([spectrum, spectrum[..., -2::-1]], axis=-1)
+    pairs = encode_fft(mirrored, 2 * count - 1)
+    return jnp.concatenate([pairs[..., :1], pairs[..., 1::2]], axis=-1)
+
+
+@jax.jit
+def decode(
+    coefficient: Float[Array | np.ndarray, "*shape coefficient"],
+    basis: SpectralBasis,
+    wavelength_nm: Float[Array | np.ndarray, " wanted"] | None = None,
+) -> Float[Array, "*shape wavelength"]:
+    """Return spectra from their coefficients, eq. (11).
+
+    Args:
+        coefficient: Coefficients [1/sr] in the order of `coefficient_names`.
+        basis: From `make_basis`.
+        wavelength_nm: Where [nm]; the measured wavelengths if None. Inside the measured range.
+
+    Returns:
+        Values [1/sr]; a truncated series may be negative, and ends with the value it starts with.
+
+    Numerics:
+        Between measured wavelengths a series is itself; samples ("identity") are joined by
+        straight lines, which cannot undershoot. Beyond the range a series repeats or mirrors itself.
+    """
+    synthesis = basis.synthesis if wavelength_nm is None else _functions_at(wavelength_nm, basis)
+    return jnp.matmul(coefficient, jnp.asarray(synthesis, coefficient.dtype))
+
+
+def encode_field(gridded: GriddedBRDF, basis: SpectralBasis) -> SpectralField:
+    """Return the coefficients at every node of the grid."""
+    return SpectralField(
+        gridded.theta_i,
+        gridded.theta_o,
+        gridded.phi_o,
+        encode(gridded.brdf, basis),
+        basis,
+        window=gridded.window,
+        interpolate_theta_i=gridded.interpolate_theta_i,
+    )
+
+
+def mean_spectrum(
+    coefficient: Float[Array | np.ndarray, "*shape coefficient"], basis: SpectralBasis
+) -> Float[Array | np.ndarray, "*shape"]:
+    """Return the mean of spectra over the wavelengths [1/sr]: half of the first coefficient of a series."""
+    if basis.kind == "identity":
+        return coefficient.mean(axis=-1)
+    return coefficient[..., 0] / 2
+
+
+def _position(wavelength_nm, measured_nm):
+    """Return wavelengths as positions from 0 to 1 over the measured range."""
+    return (wavelength_nm - measured_nm[0]) / (measured_nm[-1] - measured_nm[0])
+
+
+def _series(position, kind, count, xp):
+    """Return the functions of eq. (11) [coefficient, wavelength] at positions from 0 to 1, by NumPy or JAX as `xp`."""
+    waves = [0.5 + 0 * position]
+    if kind == "cosine":
+        waves += [xp.cos(math.pi * k * position) for k in range(1, count)]
+    else:
+        for k in range(1, count // 2 + 1):
+            waves += [xp.cos(2 * math.pi * k * position), xp.sin(2 * math.pi * k * position)]
+    return xp.stack(waves)
+
+
+def _functions_at(wavelength_nm, basis):
+    """Return the basis' functions at wavelengths, as `synthesis` holds them at the measured ones."""
+    measured, count = jnp.asarray(basis.wavelength_nm, wavelength_nm.dtype), basis.synthesis.shape[0]
+    if basis.kind != "identity":
+        return _series(_position(wavelength_nm, measured), basis.kind, count, jnp)
+    if count == 1:
+        return jnp.ones((1, *wavelength_nm.shape), wavelength_nm.dtype)
+    # node j's hat is the interpolation of the j-th row of the identity
+    identity = jnp.eye(count, dtype=wavelength_nm.dtype)
+    return jax.vmap(lambda row: jnp.interp(wavelength_nm, measured, row))(identity)

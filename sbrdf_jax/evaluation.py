@@ -1,0 +1,295 @@
+"""Any stage's answer at any direction and wavelength.
+
+Eq. (5) under the window of eq. (17) for the grid, eq. (13) decoded for the compact form.
+
+A kernel describes one direction; `evaluate` batches it. A new stage, or a method with a
+field of its own, registers its kernel for its record with `direction_kernel.register`.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Real
+
+from sbrdf_jax.encoding import decode
+from sbrdf_jax.records import CompactBRDF, GriddedBRDF, SpectralField
+from sbrdf_jax.representation.paper import compact_coefficient
+from sbrdf_jax.sinc import azimuth_distance, polar_distance, separable_weights
+
+CHUNK_BYTES = 128 * 2**20  # working memory of one chunk of directions
+
+
+@jax.jit
+def evaluate(
+    result: Any,
+    theta_i: Float[ArrayLike, "*#shape"] | int,
+    theta_o: Float[ArrayLike, "*#shape"] | int,
+    phi_o: Float[ArrayLike, "*#shape"] | int,
+    wavelength_nm: Real[ArrayLike, "*wavelength"] | None = None,
+) -> Float[Array, "*shape wavelength"]:
+    """Evaluate a result of any stage; pure and jitted, for use under jit, vmap and grad.
+
+    Xu, eq. (5) times the window of eq. (17) for the grid, eq. (13) decoded by eq. (11) for
+    the compact form, which is linear between neighbouring incident angles.
+
+    Args:
+        result: GriddedBRDF, SpectralField, CompactBRDF, or a record with a registered kernel.
+        theta_i: Polar angle of incidence [rad], 0 to pi/2; the three angles broadcast.
+        theta_o: Polar angle of exitance [rad], 0 to pi/2.
+        phi_o: Azimuth of exitance [rad], any; the mirror direction is at pi.
+        wavelength_nm: Where to evaluate the spectrum; the measured wavelengths unless given.
+
+    Returns:
+        BRDF [1/sr].
+
+    Raises:
+        TypeError: the record has no kernel (raised while tracing).
+
+    Numerics:
+        Between wavelengths the grid is a C1 cubic, the compact form its own basis; outside
+        the measured range the value is NaN, never an extrapolation. Directions are not
+        checked. At a pole, eq. (5) is not constant in phi_o between its nodes: its weights
+        do not sum to 1, and the paper does not renormalise them.
+    """
+    if direction_kernel.dispatch(type(result)) is direction_kernel.dispatch(object):
+        raise TypeError(f"{type(result).__name__} cannot be evaluated: no kernel is registered for it")
+    dtype = jnp.asarray(result.theta_i).dtype
+    angles = jnp.broadcast_arrays(*(jnp.asarray(a, dtype) for a in (theta_i, theta_o, phi_o)))
+    wavelength = None if wavelength_nm is None else jnp.atleast_1d(jnp.asarray(wavelength_nm, dtype))
+    kernel = functools.partial(direction_kernel, result, wavelength_nm=wavelength)
+    value = jax.vmap(kernel)(*(a.reshape(-1) for a in angles))
+    if wavelength is not None:
+        outside = outside_range(wavelength, jnp.asarray(measured_wavelengths(result), dtype))
+        value = jnp.where(outside[None, :], jnp.nan, value)
+    return value.reshape(*angles[0].shape, value.shape[-1])
+
+
+@functools.singledispatch
+def direction_kernel(result, theta_i, theta_o, phi_o, *, wavelength_nm=None) -> Float[Array, " wavelength"]:
+    """BRDF [1/sr] of one record in one direction, at its own wavelengths or at `wavelength_nm`."""
+    raise NotImplementedError
+
+
+@direction_kernel.register
+def _(result: GriddedBRDF, theta_i, theta_o, phi_o, *, wavelength_nm=None):
+    if result.method != "paper":
+        raise TypeError(f"method {result.method!r} has a field of its own: evaluate that, not its nodes")
+    value = interpolate_nodes(result, jnp.asarray(result.brdf), theta_i, theta_o, phi_o)
+    if wavelength_nm is None:
+        return value
+    return spectral_weights(wavelength_nm, jnp.asarray(result.wavelength_nm)) @ value
+
+
+@direction_kernel.register
+def _(result: SpectralField, theta_i, theta_o, phi_o, *, wavelength_nm=None):
+    coefficient = interpolate_nodes(result, jnp.asarray(result.coefficient), theta_i, theta_o, phi_o)
+    return decode(coefficient, result.basis, wavelength_nm)
+
+
+@direction_kernel.register
+def _(result: CompactBRDF, theta_i, theta_o, phi_o, *, wavelength_nm=None):
+    nodes = jnp.asarray(result.theta_i)
+    if result.interpolate_theta_i and nodes.shape[0] > 1:
+        lower, upper, share = bracket(theta_i, nodes)
+        below = compact_coefficient(result, lower, theta_o, phi_o)
+        above = compact_coefficient(result, upper, theta_o, phi_o)
+        coefficient = (1 - share) * below + share * above
+    else:
+        coefficient = compact_coefficient(result, nearest(theta_i, nodes), theta_o, phi_o)
+    return decode(coefficient, result.basis, wavelength_nm)
+
+
+def measured_wavelengths(result) -> Float[Array | np.ndarray, " wavelength"]:
+    """The measured wavelengths [nm] of a record: its own, or those of its spectral basis."""
+    return result.wavelength_nm if hasattr(result, "wavelength_nm") else result.basis.wavelength_nm
+
+
+def outside_range(
+    wavelength_nm: Float[Array, " query"], measured_nm: Float[Array, " wavelength"]
+) -> Bool[Array, " query"]:
+    """True where a wavelength lies outside the measured range, but for rounding."""
+    slack = 1e-9 * measured_nm[-1]
+    return (wavelength_nm < measured_nm[0] - slack) | (wavelength_nm > measured_nm[-1] + slack)
+
+
+def nearest(angle: Float[Array, ""], nodes: Float[Array, " node"]) -> Int[Array, ""]:
+    """Index of the node nearest to an angle."""
+    return jnp.argmin(jnp.abs(angle - nodes))
+
+
+def bracket(
+    angle: Float[Array, ""], nodes: Float[Array, " node"]
+) -> tuple[Int[Array, ""], Int[Array, ""], Float[Array, ""]]:
+    """Return the two nodes around an angle and the share of the upper one; angles beyond the nodes are clamped."""
+    lower = jnp.clip(jnp.searchsorted(nodes, angle, side="right") - 1, 0, nodes.shape[0] - 2)
+    share = (angle - nodes[lower]) / (nodes[lower + 1] - nodes[lower])
+    return lower, lower + 1, jnp.clip(share, 0.0, 1.0)
+
+
+def node_weights(grid: GriddedBRDF | SpectralField, theta_i, theta_o, phi_o):
+    """Return eq. (5)'s weights under the grid's window for one direction, as separable triples.
+
+    The last axis of phi_o weighs the distinct nodes: 0 and 2 pi are one. Where nothing is
+    interpolated over theta_i, its nearest node has all the weight.
+    """
+    nodes_i, nodes_o = jnp.asarray(grid.theta_i), jnp.asarray(grid.theta_o)
+    num_phi = grid.phi_o.shape[0] - 1
+    along_i = polar_distance(theta_i, nodes_i) if grid.interpolate_theta_i else jnp.zeros(1, nodes_i.dtype)
+    step_i = nodes_i[1] - nodes_i[0] if grid.interpolate_theta_i else 1.0
+    distances = (along_i, polar_distance(theta_o, nodes_o), azimuth_distance(phi_o, num_phi))
+    steps = (step_i, nodes_o[1] - nodes_o[0], 2 * np.pi / num_phi)
+    terms = separable_weights(distances, steps, grid.window)
+    if grid.interpolate_theta_i:
+        return terms
+    chosen = jax.nn.one_hot(nearest(theta_i, nodes_i), nodes_i.shape[0], dtype=nodes_i.dtype)
+    return tuple((chosen * along[0], over_o, over_phi) for along, over_o, over_phi in terms)
+
+
+def interpolate_nodes(
+    grid: GriddedBRDF | SpectralField,
+    node_value: Float[Array, "theta_i theta_o phi_o channel"],
+    theta_i: Float[Array, ""],
+    theta_o: Float[Array, ""],
+    phi_o: Float[Array, ""],
+) -> Float[Array, " channel"]:
+    """Xu, eq. (5) times eq. (17): the field in one direction from values at all nodes.
+
+    The weights of all nodes are formed first, so that a batch of directions is one matrix
+    product with the nodes.
+    """
+    terms = node_weights(grid, theta_i, theta_o, phi_o)
+    weight = sum(jnp.einsum("m,n,l->mnl", *term) for term in terms)
+    distinct = node_value[:, :, :-1]
+    return weight.reshape(-1) @ distinct.reshape(-1, distinct.shape[-1])
+
+
+def spectral_weights(
+    wavelength_nm: Float[Array, " query"], nodes_nm: Float[Array, " wavelength"]
+) -> Float[Array, "query wavelength"]:
+    """Weights of C1 cubic (Hermite) interpolation over increasing, possibly uneven, wavelengths.
+
+    Slopes are those of the parabola through three neighbouring nodes, so each interval uses
+    four nodes, the nodes are met exactly and parabolas are reproduced. Two nodes give a
+    straight line, one node a constant. Weights beyond the ends continue the last cubic.
+    """
+    count = nodes_nm.shape[0]
+    if count == 1:
+        return jnp.ones((wavelength_nm.shape[0], 1), nodes_nm.dtype)
+    lower = jnp.clip(jnp.searchsorted(nodes_nm, wavelength_nm, side="right") - 1, 0, count - 2)
+    width = nodes_nm[lower + 1] - nodes_nm[lower]
+    x = (wavelength_nm - nodes_nm[lower]) / width
+    unit, slope = jnp.eye(count, dtype=nodes_nm.dtype), slope_matrix(nodes_nm)
+    value_low, value_high = (1 + 2 * x) * (1 - x) ** 2, x**2 * (3 - 2 * x)
+    slope_low, slope_high = width * x * (1 - x) ** 2, width * x**2 * (x - 1)
+    return (
+        value_low[:, None] * unit[lower]
+        + value_high[:, None] * unit[lower + 1]
+        + slope_low[:, None] * slope[lower]
+        + slope_high[:, None] * slope[lower + 1]
+    )
+
+
+def slope_matrix(nodes: Float[Array, " node"]) -> Float[Array, "node node"]:
+    """Matrix from values at uneven nodes to slopes there, by the parabola through three neighbouring nodes."""
+    count = nodes.shape[0]
+    if count == 2:
+        row = jnp.stack([-1.0 / (nodes[1] - nodes[0]), 1.0 / (nodes[1] - nodes[0])])
+        return jnp.stack([row, row])
+    first = jnp.clip(jnp.arange(count) - 1, 0, count - 3)
+    at, (a, b, c) = nodes, (nodes[first + k] for k in range(3))
+    unit = jnp.eye(count, dtype=nodes.dtype)
+    weight_a = (2 * at - b - c) / ((a - b) * (a - c))
+    weight_b = (2 * at - a - c) / ((b - a) * (b - c))
+    weight_c = (2 * at - a - b) / ((c - a) * (c - b))
+    weights = (weight_a, weight_b, weight_c)
+    return sum(w[:, None] * unit[first + k] for k, w in enumerate(weights))
+
+
+def evaluate_in_chunks(
+    result: Any,
+    theta_i: npt.ArrayLike,
+    theta_o: npt.ArrayLike,
+    phi_o: npt.ArrayLike,
+    wavelength_nm: npt.ArrayLike | None = None,
+    *,
+    chunk_size: int | None = None,
+) -> np.ndarray:
+    """Evaluate many directions on the host in chunks of equal shape, so that working memory stays bounded.
+
+    Args:
+        result: As for `evaluate`.
+        theta_i: Polar angle of incidence [rad]; the three angles broadcast.
+        theta_o: Polar angle of exitance [rad].
+        phi_o: Azimuth of exitance [rad].
+        wavelength_nm: As for `evaluate`.
+        chunk_size: Directions at a time; unless given, what keeps a chunk's arrays near 128 MiB.
+
+    Returns:
+        BRDF [1/sr], NumPy, in the common shape of the angles plus the wavelength axis.
+    """
+    angles = np.broadcast_arrays(*(np.asarray(a, float) for a in (theta_i, theta_o, phi_o)))
+    flat = [a.reshape(-1) for a in angles]
+    wavelength = None if wavelength_nm is None else np.atleast_1d(np.asarray(wavelength_nm, float))
+    num_wavelengths = len(measured_wavelengths(result)) if wavelength is None else len(wavelength)
+    count = flat[0].size
+    size = min(chunk_size or max(1, CHUNK_BYTES // (8 * numbers_per_direction(result))), max(count, 1))
+    value = np.empty((count, num_wavelengths))
+    for start in range(0, count, size):
+        part = [a[start : start + size] for a in flat]
+        length = part[0].size
+        padded = [np.pad(a, (0, size - length), mode="edge") for a in part]  # equal shapes compile once
+        value[start : start + length] = np.asarray(evaluate(result, *padded, wavelength))[:length]
+    return value.reshape(*angles[0].shape, num_wavelengths)
+
+
+def numbers_per_direction(result) -> int:
+    """Rough count of the numbers that one direction needs while it is evaluated."""
+    if isinstance(result, GriddedBRDF):
+        return 2 * int(np.prod(result.brdf.shape[:3])) + 2 * result.brdf.shape[3]
+    if isinstance(result, SpectralField):
+        return 2 * int(np.prod(result.coefficient.shape[:3])) + 2 * len(result.basis.wavelength_nm)
+    return sum(int(np.prod(np.shape(leaf)[1:])) for leaf in jax.tree.leaves(result)) + 1
+
+
+def evaluate_on_axes(
+    result: Any,
+    theta_i: npt.ArrayLike,
+    theta_o: npt.ArrayLike,
+    phi_o: npt.ArrayLike,
+    wavelength_nm: npt.ArrayLike | None = None,
+) -> np.ndarray:
+    """Evaluate every combination of three axes on the host: [theta_i, theta_o, phi_o, wavelength].
+
+    For the grid, eq. (5) is separable: three small products replace one row of weights for
+    every direction. Other records are evaluated direction by direction, in chunks.
+    """
+    if isinstance(result, GriddedBRDF):
+        wavelength = None if wavelength_nm is None else jnp.asarray(wavelength_nm, float)
+        axes = (jnp.asarray(a, float) for a in (theta_i, theta_o, phi_o))
+        return np.asarray(_grid_on_axes(result, *axes, wavelength))
+    mesh = np.meshgrid(theta_i, theta_o, phi_o, indexing="ij")
+    return evaluate_in_chunks(result, *mesh, wavelength_nm)
+
+
+@jax.jit
+def _grid_on_axes(grid: GriddedBRDF, theta_i, theta_o, phi_o, wavelength_nm):
+    if grid.method != "paper":
+        raise TypeError(f"method {grid.method!r} has a field of its own: evaluate that, not its nodes")
+    zero = jnp.zeros((), jnp.asarray(grid.theta_i).dtype)
+    along_i = jax.vmap(lambda t: [term[0] for term in node_weights(grid, t, zero, zero)])(theta_i)
+    along_o = jax.vmap(lambda t: [term[1] for term in node_weights(grid, zero, t, zero)])(theta_o)
+    along_phi = jax.vmap(lambda p: [term[2] for term in node_weights(grid, zero, zero, p)])(phi_o)
+    nodes = jnp.asarray(grid.brdf)[:, :, :-1]
+    value = sum(
+        jnp.einsum("am,bn,cl,mnlw->abcw", w_i, w_o, w_phi, nodes)
+        for w_i, w_o, w_phi in zip(along_i, along_o, along_phi, strict=True)
+    )
+    if wavelength_nm is None:
+        return value
+    measured = jnp.asarray(grid.wavelength_nm)
+    value = jnp.einsum("abcw,vw->abcv", value, spectral_weights(wavelength_nm, measured))
+    return jnp.where(outside_range(wavelength_nm, measured)[None, None, None, :], jnp.nan, value)

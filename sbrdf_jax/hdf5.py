@@ -1,0 +1,111 @@
+"""HDF5 as this project writes it: units, dimension scales, chunks, no time stamps; and a wary reader of it."""
+
+import functools
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import h5py
+import numpy as np
+
+from sbrdf_jax.errors import UserError
+
+CHUNKED_FROM = 2  # dimensions; smaller datasets are contiguous
+MOST_EXPANSION = 1000  # a dataset may declare at most this many times what it holds, or the file is refused
+
+
+def degrees(angle) -> np.ndarray:
+    """Radians to degrees, without the rounding that makes 22.500000000000004 of 22.5."""
+    exact = np.rad2deg(np.asarray(angle, float))
+    short = np.round(exact, 9)
+    return np.where(np.isclose(exact, short, rtol=4e-16, atol=1e-15), short, exact)
+
+
+def dataset(group: h5py.Group, name: str, value, units: str, axes: list[h5py.Dataset]) -> h5py.Dataset:
+    """Write one dataset with units and a dimension scale on each axis; chunked by its first axis where it has more."""
+    value = np.asarray(value)
+    if value.dtype.kind == "f":
+        value = value.astype(np.float64)
+    options: dict[str, Any] = {"track_times": False}  # equal input, equal bytes
+    if value.ndim >= CHUNKED_FROM and value.size:
+        options |= {"chunks": (1, *value.shape[1:]), "fletcher32": True}
+    written = group.create_dataset(name, data=value, dtype=value.dtype, **options)
+    written.attrs["units"] = units
+    for dimension, axis in enumerate(axes):
+        written.dims[dimension].attach_scale(axis)
+        written.dims[dimension].label = axis.name.rsplit("/", 1)[-1]
+    return written
+
+
+def scale(group: h5py.Group, name: str, value, units: str) -> h5py.Dataset:
+    """Write an axis as a dimension scale."""
+    written = dataset(group, name, value, units, [])
+    written.make_scale(name)
+    return written
+
+
+def write_mapping(group: h5py.Group, mapping: Mapping[str, Any], units: str) -> None:
+    """Write a nested mapping: mappings as groups, arrays and numbers as datasets, the rest as JSON attributes."""
+    for name, value in mapping.items():
+        if isinstance(value, Mapping):
+            write_mapping(group.create_group(name), value, units)
+        elif isinstance(value, (np.ndarray, np.generic, int, float)) and np.asarray(value).dtype.kind in "biuf":
+            value = np.asarray(value)
+            axes = [scale(group, f"{name}_axis{k}", np.arange(n), "1") for k, n in enumerate(value.shape)]
+            dataset(group, name, value, units, axes)
+        else:
+            group.attrs[name] = json.dumps(value)
+
+
+def read(group: h5py.Group, name: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
+    """Read one numeric dataset after a look at its kind, shape and size.
+
+    Raises:
+        ValueError: it is no array of numbers, has another shape than its axes, or declares far more than it holds.
+    """
+    stored = group[name]
+    if not isinstance(stored, h5py.Dataset) or stored.dtype.kind not in "biuf":
+        raise ValueError(f"{group.name}/{name}: expected an array of numbers")
+    if shape is not None and stored.shape != shape:
+        raise ValueError(f"{group.name}/{name}: found shape {stored.shape}, expected {shape}")
+    if stored.nbytes > MOST_EXPANSION * stored.id.get_storage_size() + 4096:
+        raise ValueError(f"{group.name}/{name}: declares {stored.nbytes} bytes, far more than it holds")
+    return np.asarray(stored[()])
+
+
+def read_datasets(group: h5py.Group) -> dict[str, np.ndarray]:
+    """Read all datasets below a group, by their paths, but for the group's own axes."""
+    found: dict[str, np.ndarray] = {}
+
+    def visit(name, item):
+        if isinstance(item, h5py.Dataset) and not item.is_scale:
+            found[name] = read(group, name)
+
+    group.visititems(visit)
+    return found
+
+
+def read_mapping(group: h5py.Group) -> dict[str, Any]:
+    """Read what `write_mapping` wrote."""
+    found: dict[str, Any] = {name: json.loads(value) for name, value in group.attrs.items()}
+    for name, item in group.items():
+        if isinstance(item, h5py.Group):
+            found[name] = read_mapping(item)
+        elif not item.is_scale:
+            value = read(group, name)
+            found[name] = value if value.ndim else value[()].item()
+    return found
+
+
+def one_line_errors(read):
+    """Turn whatever a damaged file makes h5py or NumPy raise into one line that names the file."""
+
+    @functools.wraps(read)
+    def wrapped(path, *args, **kwargs):
+        try:
+            return read(path, *args, **kwargs)
+        except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError, OverflowError) as error:
+            reason = " ".join(str(error).split())
+            raise UserError(f"{path}: the result cannot be read, it is damaged: {reason}") from error
+
+    return wrapped

@@ -1,0 +1,191 @@
+"""Where each stage's record lies in the result file, with what units and axes: write and read."""
+
+import dataclasses
+import json
+
+import h5py
+import numpy as np
+
+from sbrdf_jax.cleaning import CleanEntry, CleanReport, Flag
+from sbrdf_jax.coverage import Coverage
+from sbrdf_jax.encoding import coefficient_names, make_basis
+from sbrdf_jax.errors import UserError
+from sbrdf_jax.harmonics import harmonic_orders
+from sbrdf_jax.hdf5 import dataset, degrees, read, scale
+from sbrdf_jax.lobes import LOBE_KINDS
+from sbrdf_jax.metrics import stored_numbers
+from sbrdf_jax.records import STATUS_TEXT, CompactBRDF, GriddedBRDF, SpectralBasis, SpectralField, Status
+
+_ANGLES = ("theta_i", "theta_o", "phi_o")
+
+
+def write_grid(group: h5py.Group, gridded: GriddedBRDF) -> None:
+    """Write the resampled field at its nodes, and how well each wavelength was solved."""
+    for name in ("method", "window"):
+        group.attrs[name] = getattr(gridded, name)
+    for name in ("bilateral", "interpolate_theta_i"):
+        group.attrs[name] = bool(getattr(gridded, name))
+    axes = {name: scale(group, f"{name}_deg", degrees(getattr(gridded, name)), "deg") for name in _ANGLES}
+    axes["wavelength"] = scale(group, "wavelength_nm", gridded.wavelength_nm, "nm")
+    directions = [axes[name] for name in _ANGLES]
+    dataset(group, "brdf", gridded.brdf, "1/sr", [*directions, axes["wavelength"]])
+    flags = dataset(group, "extrapolated", np.asarray(gridded.extrapolated, np.uint8), "1", directions)
+    flags.attrs["names"] = "measured nearby,interpolated,beyond the measured range"
+    dataset(group, "kkt_residual", gridded.kkt_residual, "1", [axes["wavelength"]])
+    dataset(group, "num_steps", np.asarray(gridded.num_steps, np.int64), "1", [axes["wavelength"]])
+    status_dataset(group, gridded.status, [axes["wavelength"]])
+
+
+def write_field(group: h5py.Group, field: SpectralField, grid: h5py.Group) -> None:
+    """Write the spectral coefficients at the nodes of the grid."""
+    names = coefficient_names(field.basis)
+    index = scale(group, "coefficient", np.arange(len(names)), "1")
+    axes = [grid[f"{name}_deg"] for name in _ANGLES]
+    written = dataset(group, "coefficients", field.coefficient, "1/sr", [*axes, index])
+    written.attrs["basis"] = field.basis.kind
+    written.attrs["coefficient_order"] = ",".join(names)
+
+
+def write_compact(group: h5py.Group, compact: CompactBRDF) -> None:
+    """Write all that evaluation of the compact stage needs, and how each lane ended."""
+    orders = harmonic_orders(compact.max_degree)
+    names = coefficient_names(compact.basis)
+    group.attrs["method"] = "paper"
+    group.attrs["stored_numbers"] = stored_numbers(compact)
+    group.attrs["basis"] = compact.basis.kind
+    group.attrs["max_degree"] = compact.max_degree
+    group.attrs["interpolate_theta_i"] = bool(compact.interpolate_theta_i)
+    theta_i = scale(group, "theta_i_deg", degrees(compact.theta_i), "deg")
+    scale(group, "wavelength_nm", compact.basis.wavelength_nm, "nm")
+    coefficient = scale(group, "coefficient", np.arange(len(names)), "1")
+    coefficient.attrs["coefficient_order"] = ",".join(names)
+    harmonic = scale(group, "harmonic", np.arange(len(orders)), "1")
+    lane = [theta_i, coefficient]
+    background = dataset(group, "background", compact.background, "1/sr", [*lane, harmonic])
+    background.attrs["harmonic_order"] = np.array(orders)  # rows of (l, m)
+    background.attrs["coefficient_order"] = ",".join(names)
+    kind = dataset(group, "lobe_kind", np.asarray(compact.lobe_kind, np.int64), "1", lane)
+    kind.attrs["names"] = ",".join(LOBE_KINDS)
+    dataset(group, "lobe_height", compact.lobe_height, "1/sr", lane)
+    width = dataset(group, "lobe_width", compact.lobe_width, "1", lane)
+    width.attrs["meaning"] = "b of eqs. (14) to (16): rad^2 for angle_squared, else without unit"
+    dataset(group, "critical_angle_deg", degrees(compact.critical_angle), "deg", lane)
+    status_dataset(group, compact.status, lane)
+    dataset(group, "lobe_peak_theta_o_deg", degrees(compact.lobe_peak_theta_o), "deg", [theta_i])
+
+
+def write_cleaning(group: h5py.Group, report: CleanReport) -> None:
+    """Write the cleaning report: a flag per row of the file, and the table of counts and reasons."""
+    row = scale(group, "row", np.arange(len(report.flag)), "1")
+    flag = dataset(group, "flag", report.flag, "1", [row])
+    flag.attrs["bits"] = json.dumps({f.name.lower(): f.value for f in Flag if f.name and f.value})
+    dataset(group, "dead_wavelength_nm", report.dead_wavelength_nm, "nm", [])
+    group.attrs["num_rows"] = report.num_rows
+    group.attrs["num_kept"] = report.num_kept
+    group.attrs["bilateral"] = report.bilateral
+    group.attrs["entries"] = json.dumps([dataclasses.asdict(entry) for entry in report.entries])
+    theta_i = scale(group, "covered_theta_i_deg", degrees(report.coverage.theta_i), "deg")
+    dataset(group, "covered_count", report.coverage.count, "1", [theta_i])
+    dataset(group, "covered_theta_o_range_deg", degrees(report.coverage.theta_o_range), "deg", [])
+    group.attrs["covers_both_half_planes"] = report.coverage.covers_both_half_planes
+    group.attrs["covered"] = json.dumps(report.coverage.covered)
+    group.attrs["missing"] = json.dumps(report.coverage.missing)
+
+
+def status_dataset(group: h5py.Group, status, axes: list[h5py.Dataset]) -> None:
+    """Write a status per lane, with the name and the meaning of each number."""
+    written = dataset(group, "status", np.asarray(status, np.int64), "1", axes)
+    written.attrs["names"] = ",".join(s.name.lower() for s in Status)
+    written.attrs["meaning"] = json.dumps({s.name.lower(): STATUS_TEXT[s] for s in Status})
+
+
+def read_grid(group: h5py.Group) -> GriddedBRDF:
+    """Read the resampled field."""
+    axes = [read(group, f"{name}_deg") for name in _ANGLES]
+    wavelength_nm = read(group, "wavelength_nm")
+    directions, lanes = tuple(map(len, axes)), (len(wavelength_nm),)
+    return GriddedBRDF(
+        *map(np.deg2rad, axes),
+        wavelength_nm=wavelength_nm,
+        brdf=read(group, "brdf", (*directions, *lanes)),
+        extrapolated=read(group, "extrapolated", directions),
+        kkt_residual=read(group, "kkt_residual", lanes),
+        num_steps=read(group, "num_steps", lanes),
+        status=read(group, "status", lanes),
+        method=str(group.attrs["method"]),
+        window=str(group.attrs["window"]),
+        bilateral=bool(group.attrs["bilateral"]),
+        interpolate_theta_i=bool(group.attrs["interpolate_theta_i"]),
+    )
+
+
+def read_field(group: h5py.Group, gridded: GriddedBRDF) -> SpectralField:
+    """Read the spectral coefficients; their basis follows from its kind, the wavelengths and the count."""
+    stored = group["coefficients"]
+    basis = read_basis(stored.attrs["basis"], np.asarray(gridded.wavelength_nm), stored.shape[-1])
+    shape = (*np.shape(gridded.brdf)[:3], stored.shape[-1])
+    return SpectralField(
+        gridded.theta_i,
+        gridded.theta_o,
+        gridded.phi_o,
+        coefficient=read(group, "coefficients", shape),
+        basis=basis,
+        window=gridded.window,
+        interpolate_theta_i=gridded.interpolate_theta_i,
+    )
+
+
+def read_compact(group: h5py.Group) -> CompactBRDF:
+    """Read the compact form from its group alone."""
+    method = str(group.attrs["method"])
+    if method != "paper":
+        raise UserError(f"{group.file.filename}: compact: method: found {method!r}, expected 'paper'")
+    theta_i, wavelength_nm = read(group, "theta_i_deg"), read(group, "wavelength_nm")
+    max_degree = int(group.attrs["max_degree"])
+    lanes = (len(theta_i), len(read(group, "coefficient")))
+    return CompactBRDF(
+        theta_i=np.deg2rad(theta_i),
+        basis=read_basis(group.attrs["basis"], wavelength_nm, lanes[1]),
+        background=read(group, "background", (*lanes, (max_degree + 1) ** 2)),
+        lobe_kind=read(group, "lobe_kind", lanes),
+        lobe_height=read(group, "lobe_height", lanes),
+        lobe_width=read(group, "lobe_width", lanes),
+        critical_angle=np.deg2rad(read(group, "critical_angle_deg", lanes)),
+        lobe_peak_theta_o=np.deg2rad(read(group, "lobe_peak_theta_o_deg", lanes[:1])),
+        status=read(group, "status", lanes),
+        max_degree=max_degree,
+        interpolate_theta_i=bool(group.attrs["interpolate_theta_i"]),
+    )
+
+
+def read_basis(kind: str, wavelength_nm: np.ndarray, count: int) -> SpectralBasis:
+    """Make the spectral basis again that was stored by kind and count."""
+    basis = make_basis(wavelength_nm, str(kind), count)
+    if np.shape(basis.synthesis)[0] != count:
+        raise ValueError(f"{len(wavelength_nm)} wavelengths cannot carry {count} coefficients of basis {kind}")
+    return basis
+
+
+def read_cleaning(group: h5py.Group) -> CleanReport:
+    """Read the cleaning report."""
+    low, high = np.deg2rad(read(group, "covered_theta_o_range_deg", (2,)))
+    coverage = Coverage(
+        theta_i=np.deg2rad(read(group, "covered_theta_i_deg")),
+        count=read(group, "covered_count"),
+        theta_o_range=(float(low), float(high)),
+        covers_both_half_planes=bool(group.attrs["covers_both_half_planes"]),
+        covered=tuple(json.loads(group.attrs["covered"])),
+        missing=tuple(json.loads(group.attrs["missing"])),
+    )
+    entries = (
+        CleanEntry(**entry | {"examples": tuple(entry["examples"])}) for entry in json.loads(group.attrs["entries"])
+    )
+    return CleanReport(
+        flag=read(group, "flag"),
+        entries=tuple(entries),
+        dead_wavelength_nm=read(group, "dead_wavelength_nm"),
+        num_rows=int(group.attrs["num_rows"]),
+        num_kept=int(group.attrs["num_kept"]),
+        bilateral=bool(group.attrs["bilateral"]),
+        coverage=coverage,
+    )

@@ -1,0 +1,301 @@
+"""How well each stage stands for the one before it, and for physics: eq. (18) and its companions.
+
+Everything is measured through `evaluation`, as a user would see it, one incident angle at a
+time, so that memory stays that of one slice of the grid.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from sbrdf_jax import colour
+from sbrdf_jax.angles import angle_between
+from sbrdf_jax.encoding import decode
+from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_on_axes, measured_wavelengths
+from sbrdf_jax.records import CompactBRDF, GriddedBRDF, SpectralField
+from sbrdf_jax.representation.paper import compact_coefficient
+
+PAPER_DIRECTIONS = 13 * 49  # the paper's nodes of one incident angle, copies at the pole and at 360 degrees counted
+NUM_RANDOM_DIRECTIONS = 10240
+CHUNK_SIZE = 1024  # one shape for all compact evaluations here: they compile once
+ALBEDO_THETA, ALBEDO_PHI = 48, 96  # fewest quadrature points; two a node on finer grids
+
+# How the result file labels the scores: arrays run over theta_i and numbers have no unit, but for these.
+METRIC_AXES = {
+    "albedo": ("theta_i", "wavelength"),
+    "albedo_compact": ("theta_i", "wavelength"),
+    "relative_error_between_theta_i": ("theta_i_between",),
+}
+METRIC_UNITS = {"negative_depth": "1/sr", "negative_depth_grid": "1/sr"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Metrics:
+    """Scores by the names that the result file gives them, and what a user must be told."""
+
+    value: dict[str, np.ndarray]
+    warnings: tuple[str, ...]
+
+
+def measure(
+    gridded: GriddedBRDF,
+    field: SpectralField | None = None,
+    compact: CompactBRDF | None = None,
+    *,
+    absolute: bool = True,
+    seed: int = 0,
+) -> Metrics:
+    """Measure the grid, and the compact form against it.
+
+    Args:
+        gridded: The resampled field.
+        field: Its spectral coefficients, for the split of the error.
+        compact: Its compact form; without it only the grid is measured.
+        absolute: False where values are only proportional to a BRDF: albedo then warns of nothing.
+        seed: Of the random directions.
+
+    Returns:
+        The scores of the grid and, where given, of the compact form.
+    """
+    value, warnings = measure_grid(gridded, absolute=absolute, seed=seed)
+    if compact is not None:
+        value |= error_between(compact, gridded) | compression(compact)
+        matching = colour.colour_matching(np.asarray(gridded.wavelength_nm)[live_wavelengths(gridded)])
+        value |= error_at_nodes(compact, gridded, matching)
+        if matching.note:
+            warnings.append(f"colour: {matching.note}")
+        if field is not None:
+            value |= error_split(compact, field, gridded)
+        share, depth = negativity(compact, seed=seed)
+        value |= {"negative_share": share, "negative_depth": depth}
+        value["reciprocity_error_compact"] = reciprocity_error(compact, seed=seed)
+        value["albedo_compact"] = albedo(compact)
+        if absolute:
+            warnings += albedo_warnings(value["albedo_compact"], compact, "compact")
+    return Metrics({name: np.asarray(v) for name, v in value.items()}, tuple(warnings))
+
+
+def measure_grid(gridded: GriddedBRDF, *, absolute: bool = True, seed: int = 0) -> tuple[dict, list[str]]:
+    """Albedo, negative values and reciprocity of the grid stage, the share of nodes without data, and warnings."""
+    share, depth = negativity(gridded, seed=seed)
+    value = {
+        "albedo": albedo(gridded),
+        "negative_share_grid": share,
+        "negative_depth_grid": depth,
+        "reciprocity_error": reciprocity_error(gridded, seed=seed),
+        "extrapolated_share": (np.asarray(gridded.extrapolated) == 2).mean(axis=(1, 2)),
+    }
+    return value, albedo_warnings(value["albedo"], gridded, "grid") if absolute else []
+
+
+def relative_error(error_energy, energy):
+    """Xu, eq. (18): sqrt(sum of squared differences / sum of squares); 0 where both sums are 0."""
+    error_energy, energy = np.asarray(error_energy, float), np.asarray(energy, float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where((error_energy == 0) & (energy == 0), 0.0, np.sqrt(error_energy / energy))
+
+
+def relative_deviation(reconstructed: np.ndarray, original: np.ndarray) -> np.ndarray:
+    """|reconstructed - original| / |original|, value by value; 0 where both are equal, infinite where only one is 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        deviation = np.abs(reconstructed - original) / np.abs(original)
+    return np.where(reconstructed == original, 0.0, deviation)
+
+
+def error_at_nodes(compact: CompactBRDF, gridded: GriddedBRDF, matching: colour.ColourMatching) -> dict:
+    """Compare compact form and grid at the grid's nodes: eq. (18), median relative error, Delta E 2000 under D65.
+
+    All nodes count, copies at the poles and at 360 degrees included, as the paper counts;
+    wavelengths count where the whole grid is finite.
+    """
+    live = live_wavelengths(gridded)
+    error_energy, energy, deviation, delta_e = [], [], [], []
+    for i, theta_i in enumerate(np.asarray(gridded.theta_i)):
+        original = np.asarray(gridded.brdf[i])[..., live]
+        reconstructed = on_axes(compact, theta_i, gridded.theta_o, gridded.phi_o)[..., live]
+        error_energy.append(((reconstructed - original) ** 2).sum())
+        energy.append((original**2).sum())
+        deviation.append(relative_deviation(reconstructed, original).ravel())
+        delta_e.append(colour.delta_e_2000(reconstructed, original, matching).ravel())
+    return {
+        "relative_error": relative_error(error_energy, energy),
+        "relative_error_overall": relative_error(sum(error_energy), sum(energy)),
+        "median_relative_error": np.median(deviation, axis=1),
+        "median_relative_error_overall": np.median(deviation),
+        "delta_e_median": np.median(delta_e, axis=1),
+        "delta_e_p95": np.quantile(delta_e, 0.95, axis=1),
+        "delta_e_max": np.max(delta_e, axis=1),
+        "delta_e_median_overall": np.median(delta_e),
+        "delta_e_p95_overall": np.quantile(delta_e, 0.95),
+        "delta_e_max_overall": np.max(delta_e),
+    }
+
+
+def live_wavelengths(gridded: GriddedBRDF) -> np.ndarray:
+    """Mask of the wavelengths at which the whole grid is finite; the others are lanes that failed, and say so."""
+    return np.isfinite(np.asarray(gridded.brdf)).all(axis=(0, 1, 2))
+
+
+def error_between(compact: CompactBRDF, gridded: GriddedBRDF) -> dict:
+    """Eq. (18) at cell midpoints of theta_o and phi_o, against the grid stage there; and with theta_i midway too.
+
+    Midway between incident angles it is NaN where the grid interpolates nothing over them.
+    """
+    theta_i = np.asarray(gridded.theta_i)
+    theta_o, phi_o = midpoints(gridded.theta_o), midpoints(gridded.phi_o)
+    live = live_wavelengths(gridded)
+
+    def at(incidence):
+        original = on_axes(gridded, incidence, theta_o, phi_o)[..., live]
+        reconstructed = on_axes(compact, incidence, theta_o, phi_o)[..., live]
+        return relative_error(((reconstructed - original) ** 2).sum(), (original**2).sum())
+
+    midway = midpoints(theta_i)
+    interpolated = gridded.interpolate_theta_i
+    return {
+        "relative_error_between": np.array([at(t) for t in theta_i]),
+        "relative_error_between_theta_i": np.array([at(t) if interpolated else np.nan for t in midway]),
+    }
+
+
+def error_split(compact: CompactBRDF, field: SpectralField, gridded: GriddedBRDF) -> dict:
+    """Split the error at the nodes into spectral truncation, background and lobe, each as an eta of eq. (18).
+
+    Spectral: the grid against its own truncated spectra. The rest is the misfit of the
+    coefficients, which belongs to the lobe within the lane's critical angle and to the
+    background elsewhere, and everywhere in lanes without a lobe. Squares add up to that of
+    the whole but for cross terms, which are small because the bases are nearly orthogonal.
+    """
+    live = live_wavelengths(gridded)
+    parts = {"error_spectral": [], "error_background": [], "error_lobe": []}
+    for i in range(len(gridded.theta_i)):
+        original = np.asarray(gridded.brdf[i])
+        energy = (original[..., live] ** 2).sum()
+        slice_parts = _slice_split(compact, field, jnp.asarray(original), jnp.asarray(live), i)
+        for name, error in zip(parts, slice_parts, strict=True):
+            parts[name].append(relative_error(float(error), energy))
+    return {name: np.array(values) for name, values in parts.items()}
+
+
+@jax.jit
+def _slice_split(compact, field, original, live, i):
+    """Squared errors of one incident angle: spectral truncation, background, lobe."""
+    theta_o, phi_o = jnp.meshgrid(jnp.asarray(field.theta_o), jnp.asarray(field.phi_o), indexing="ij")
+    at_node = jax.vmap(jax.vmap(functools.partial(compact_coefficient, compact, i)))
+    wanted = jnp.asarray(field.coefficient)[i]
+    misfit = at_node(theta_o, phi_o) - wanted
+    peak = jnp.full_like(theta_o, jnp.asarray(compact.lobe_peak_theta_o)[i])
+    alpha = angle_between(theta_o, phi_o, peak, jnp.full_like(phi_o, jnp.pi))
+    critical = jnp.asarray(compact.critical_angle)[i]  # nan compares false: no lobe, all background
+    inside = alpha[..., None] <= critical[None, None, :]
+    spectral = original - decode(wanted, field.basis)
+    background = decode(jnp.where(inside, 0.0, misfit), field.basis)
+    lobe = decode(jnp.where(inside, misfit, 0.0), field.basis)
+    return tuple(jnp.where(live, part**2, 0.0).sum() for part in (spectral, background, lobe))
+
+
+def stored_numbers(compact: CompactBRDF) -> int:
+    """Count all numbers that the `compact` group of a result holds, its axes included.
+
+    The matrices of the spectral basis are not stored: they follow from kind, wavelengths and count.
+    """
+    fields = ("theta_i", "background", "lobe_kind", "lobe_height", "lobe_width", "critical_angle", "lobe_peak_theta_o")
+    held = sum(np.size(getattr(compact, name)) for name in (*fields, "status"))
+    num_coefficients, num_harmonics = np.shape(compact.background)[1:]
+    return held + np.size(compact.basis.wavelength_nm) + num_coefficients + num_harmonics
+
+
+def compression(compact: CompactBRDF) -> dict:
+    """Numbers of the grid at the paper's 13 x 49 x wavelengths an incident angle over the numbers of the compact form.
+
+    Only 13 x 49 - 60 of those directions are distinct, and half of them are mirror images.
+    `compression_ratio` counts everything that is stored; `compression_ratio_paper` only
+    harmonics, height and width, as the paper does.
+    """
+    num_theta_i, num_coefficients, num_harmonics = np.shape(compact.background)
+    grid = PAPER_DIRECTIONS * np.size(compact.basis.wavelength_nm)
+    return {
+        "compression_ratio": num_theta_i * grid / stored_numbers(compact),
+        "compression_ratio_paper": grid / ((num_harmonics + 2) * num_coefficients),
+    }
+
+
+def negativity(result, *, seed: int = 0) -> tuple[float, float]:
+    """Share of negative values off the nodes, and the deepest of them as a positive number [1/sr]."""
+    value = evaluate_in_chunks(result, *random_directions(result, seed), chunk_size=CHUNK_SIZE)
+    return float((value < 0).mean()), float(np.where(value < 0, -value, 0.0).max())
+
+
+def reciprocity_error(result, *, seed: int = 0) -> float:
+    """Relative RMS difference of f(i, o) and f(o, i) at random pairs of directions.
+
+    Exchanged directions have the azimuth -phi_o. Pairs beyond the incident angles of the
+    result do not count. NaN where nothing is interpolated over theta_i.
+    """
+    if not result.interpolate_theta_i:
+        return float("nan")
+    theta_i, theta_o, phi_o = random_directions(result, seed)
+    forward = evaluate_in_chunks(result, theta_i, theta_o, phi_o, chunk_size=CHUNK_SIZE)
+    backward = evaluate_in_chunks(result, theta_o, theta_i, -phi_o, chunk_size=CHUNK_SIZE)
+    known = (theta_o >= result.theta_i[0]) & (theta_o <= result.theta_i[-1])
+    energy = (forward[known] ** 2 + backward[known] ** 2).sum() / 2
+    return float(relative_error(((forward[known] - backward[known]) ** 2).sum(), energy))
+
+
+def random_directions(result, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Seeded random directions [rad]: theta_i even in angle (or on its nodes), exitance even over the hemisphere."""
+    rng = np.random.default_rng(seed)
+    nodes = np.asarray(result.theta_i)
+    theta_i = rng.uniform(nodes[0], nodes[-1], NUM_RANDOM_DIRECTIONS)
+    if not result.interpolate_theta_i:
+        theta_i = nodes[rng.integers(len(nodes), size=NUM_RANDOM_DIRECTIONS)]
+    theta_o = np.arccos(rng.uniform(0.0, 1.0, NUM_RANDOM_DIRECTIONS))
+    return theta_i, theta_o, rng.uniform(0.0, 2 * np.pi, NUM_RANDOM_DIRECTIONS)
+
+
+def albedo(result) -> Float[np.ndarray, "theta_i wavelength"]:
+    """Directional-hemispherical reflectance at each incident angle of a result: the integral of f cos(theta_o).
+
+    Gauss-Legendre in theta_o (48 points or two a node) times the midpoint rule in phi_o (96
+    or two a node) of the evaluated field, so between its nodes too.
+    """
+    nodes_o, nodes_phi = np.size(getattr(result, "theta_o", ())), np.size(getattr(result, "phi_o", ()))
+    num_theta, num_phi = max(ALBEDO_THETA, 2 * nodes_o), max(ALBEDO_PHI, 2 * (nodes_phi - 1))
+    point, weight = np.polynomial.legendre.leggauss(num_theta)
+    theta_o = (point + 1) * np.pi / 4
+    weight = weight * np.pi / 4 * np.cos(theta_o) * np.sin(theta_o)
+    phi_o = (np.arange(num_phi) + 0.5) * (2 * np.pi / num_phi)
+    rows = [weight @ on_axes(result, t, theta_o, phi_o).sum(axis=1) for t in np.asarray(result.theta_i)]
+    return np.stack(rows) * (2 * np.pi / num_phi)
+
+
+def albedo_warnings(albedo: np.ndarray, result, stage: str) -> list[str]:
+    """One sentence for each incident angle at which a stage reflects more than it receives."""
+    wavelength = np.asarray(measured_wavelengths(result))
+    warnings = []
+    for theta_i, row in zip(np.asarray(result.theta_i), albedo, strict=True):
+        if (row > 1).any():
+            warnings.append(
+                f"{stage} stage, theta_i {np.rad2deg(theta_i):g} degrees: albedo up to {np.nanmax(row):.3g} "
+                f"at {wavelength[np.nanargmax(row)]:g} nm, above 1 at {(row > 1).sum()} of {row.size} wavelengths: "
+                "it creates energy"
+            )
+    return warnings
+
+
+def midpoints(axis) -> np.ndarray:
+    """Midpoints of the cells of an axis."""
+    axis = np.asarray(axis)
+    return (axis[:-1] + axis[1:]) / 2
+
+
+def on_axes(result, theta_i: float, theta_o, phi_o) -> Float[np.ndarray, "theta_o phi_o wavelength"]:
+    """Evaluate one incident angle at every combination of theta_o and phi_o [rad]."""
+    if isinstance(result, GriddedBRDF):
+        return evaluate_on_axes(result, np.array([theta_i]), np.asarray(theta_o), np.asarray(phi_o))[0]
+    mesh = np.meshgrid(np.asarray(theta_o), np.asarray(phi_o), indexing="ij")
+    return evaluate_in_chunks(result, np.full(mesh[0].shape, theta_i), *mesh, chunk_size=CHUNK_SIZE)

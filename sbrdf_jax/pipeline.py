@@ -1,0 +1,155 @@
+"""Strings the stages together: a measurement and options in, a result out; no files."""
+
+import contextlib
+import dataclasses
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+
+from sbrdf_jax.cleaning import CleanResult, clean
+from sbrdf_jax.encoding import coefficients_allowed, encode_field, make_basis
+from sbrdf_jax.grid import Grid, make_grid
+from sbrdf_jax.metrics import measure
+from sbrdf_jax.options import RunOptions
+from sbrdf_jax.plan import PlanRow, plan_run
+from sbrdf_jax.progress import Progress, StageClock
+from sbrdf_jax.records import STATUS_TEXT, RawSamples, SpectralBasis, Status
+from sbrdf_jax.representation import represent
+from sbrdf_jax.resampling import resample
+from sbrdf_jax.runtime import compile_clock
+from sbrdf_jax.store import RunResult
+
+FAILED = (Status.MAX_STEPS, Status.NONFINITE)
+
+
+@dataclasses.dataclass(frozen=True)
+class Prepared:
+    """What is known before anything is solved."""
+
+    cleaned: CleanResult
+    grid: Grid
+    basis: SpectralBasis
+    rows: list[PlanRow]
+    warnings: tuple[str, ...]
+
+
+def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
+    """Clean a measurement, lay out its grid and count the work.
+
+    Args:
+        raw: All rows of a file.
+        options: Resolved options.
+
+    Returns:
+        The cleaned samples, the grid, the spectral basis, the plan, and what a user must be told.
+
+    Raises:
+        UserError: The measurement is not enough for a grid.
+    """
+    cleaned = clean(raw, bilateral=options.input.bilateral, method=options.resample.method)
+    grid = make_grid(cleaned.samples, options.grid, bilateral=cleaned.report.bilateral)
+    wanted = options.encode.coefficients
+    wavelengths = cleaned.samples.wavelength_nm
+    allowed = coefficients_allowed(len(wavelengths), int(wanted), options.encode.basis)
+    basis = make_basis(wavelengths, allowed.kind, allowed.coefficients)
+    rows = plan_run(cleaned.samples, raw.num_samples, grid, allowed.coefficients, options)
+    warnings = [f"not measured: {text}" for text in cleaned.report.coverage.missing]
+    if allowed.warning:
+        warnings.append(allowed.warning)
+    return Prepared(cleaned, grid, basis, rows, tuple(warnings))
+
+
+def process(raw: RawSamples, options: RunOptions, progress: Progress) -> RunResult:
+    """Run every stage on one measurement.
+
+    Args:
+        raw: All rows of a file.
+        options: Resolved options.
+        progress: Told of each stage.
+
+    Returns:
+        The result, but for what only its caller knows: config text, time of creation, versions.
+    """
+    timing: dict[str, dict[str, float]] = {}
+    with _timed(progress, timing, "clean"):
+        ready = prepare(raw, options)
+        samples, report = ready.cleaned.samples, ready.cleaned.report
+        progress.update(f"{report.num_kept} of {report.num_rows} samples kept")
+
+    with _timed(progress, timing, "resample"):
+        gridded = resample(
+            samples,
+            ready.grid,
+            options.resample,
+            lambda done, total: progress.update(f"{done} of {total} wavelengths converged"),
+        )
+
+    with _timed(progress, timing, "encode"):
+        field = encode_field(gridded, ready.basis)
+        progress.update(f"{np.shape(field.coefficient)[-1]} coefficients, basis {ready.basis.kind}")
+
+    with _timed(progress, timing, "represent"):
+        compact = represent(field, options.represent)
+        progress.update(count_statuses(compact.status))
+
+    with _timed(progress, timing, "measure"):
+        metrics = measure(gridded, field, compact, absolute=raw.quantity == "brdf")
+
+    return RunResult(
+        gridded=gridded,
+        field=field,
+        compact=compact,
+        metrics=metrics.value,
+        clean=report,
+        input={
+            "source": raw.source,
+            "format": raw.source_format,
+            "quantity": raw.quantity,
+            "num_samples": raw.num_samples,
+            "notes": list(raw.notes),
+        },
+        plan={row.stage + " " + row.what: dataclasses.asdict(row) for row in ready.rows}
+        | {"coefficients_used": np.shape(field.coefficient)[-1]},
+        timing=timing,
+        warnings=ready.warnings + metrics.warnings,
+        source_sha256=raw.source_sha256,
+    )
+
+
+def count_statuses(status) -> str:
+    """Count lanes by how they ended: "212 ok, 35 no_lobe"."""
+    counts = Counter(Status(int(value)).name.lower() for value in np.ravel(np.asarray(status)))
+    return ", ".join(f"{count} {name}" for name, count in counts.most_common())
+
+
+def failed_lanes(result: RunResult) -> list[str]:
+    """Return a line for each group of lanes that ended without reaching its tolerance, or not finite."""
+    lines = []
+    stages = {"resample": (result.gridded.status, "wavelengths")}
+    if result.compact is not None:
+        stages["represent"] = (result.compact.status, "lanes")
+    for stage, (status, what) in stages.items():
+        status = np.asarray(status)
+        for value in FAILED:
+            bad = np.argwhere(status == int(value))
+            if len(bad):
+                first = ", ".join(_lane_name(result, stage, index) for index in bad[:5])
+                more = ", ..." if len(bad) > 5 else ""
+                lines.append(f"{stage}: {len(bad)} of {status.size} {what} {STATUS_TEXT[value]}: {first}{more}")
+    return lines
+
+
+def _lane_name(result: RunResult, stage: str, index: np.ndarray) -> str:
+    if stage == "resample":
+        return f"{np.asarray(result.gridded.wavelength_nm)[index[0]]:g} nm"
+    theta_i = np.rad2deg(np.asarray(result.gridded.theta_i)[index[0]])
+    return f"theta_i {theta_i:g} degrees, coefficient {index[1]}"
+
+
+@contextlib.contextmanager
+def _timed(progress: Progress, timing: dict[str, dict[str, float]], name: str) -> Iterator[StageClock]:
+    with progress.stage(name) as clock, compile_clock() as compiled:
+        yield clock
+        clock.compile_seconds = compiled.seconds
+    timing[name] = {"total": clock.seconds, "compile": compiled.seconds, "run": clock.seconds - compiled.seconds}

@@ -1,0 +1,65 @@
+"""What a run computes and what it skips, and why; decided on the host, before anything is traced."""
+
+import dataclasses
+
+from sbrdf_jax.grid import Grid
+from sbrdf_jax.options import RunOptions
+from sbrdf_jax.records import RawSamples
+from sbrdf_jax.resampling.normal import Layout
+
+CRITICAL_ANGLES = 21
+BYTES = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class PlanRow:
+    """How much of one stage is needed."""
+
+    stage: str
+    what: str
+    needed: int
+    total: int
+    reason: str
+
+
+def plan_run(kept: RawSamples, num_read: int, grid: Grid, coefficients: int, options: RunOptions) -> list[PlanRow]:
+    """Count what each stage needs of what there is.
+
+    Args:
+        kept: The samples that cleaning kept.
+        num_read: Samples in the file.
+        grid: The grid to fill.
+        coefficients: Real coefficients per spectrum.
+        options: Resolved options.
+
+    Returns:
+        A row per stage; the represent stage is an upper limit, since the data decide which lanes need a lobe.
+    """
+    wavelengths = len(kept.wavelength_nm)
+    nodes = len(grid.theta_i) * len(grid.theta_o) * (grid.num_phi_o + 1)
+    lanes = len(grid.theta_i) * coefficients
+    kinds = 3 if options.represent.lobe == "best" else 1
+    folded = "phi_o folded, poles tied" if grid.bilateral else "poles tied, 360 degrees = 0"
+    return [
+        PlanRow("clean", "samples", kept.num_samples, num_read, "what is dropped is listed by reason"),
+        PlanRow("resample", "unknowns", grid.num_unknowns, nodes, folded),
+        PlanRow("resample", "wavelengths", wavelengths, wavelengths, "no scene: every wavelength"),
+        PlanRow("encode", "coefficients", coefficients, wavelengths, f"basis {options.encode.basis}"),
+        PlanRow("represent", "lanes", lanes, lanes, "incident angles x coefficients"),
+        PlanRow("represent", "lobe fits, at most", lanes * CRITICAL_ANGLES * kinds, lanes * CRITICAL_ANGLES * 3,
+                "lanes that the background explains are skipped"),
+    ]
+
+
+def resample_bytes(grid: Grid, num_samples: int, num_groups: int, wavelengths: int) -> int:
+    """Predict the memory of the resampling: the Kronecker sum's blocks and the solver's arrays [bytes]."""
+    layout = Layout.of(grid)
+    terms = min(num_groups, layout.num_theta_i**2)
+    return BYTES * (terms * layout.num_directions**2 + 12 * grid.num_unknowns * wavelengths + num_samples * wavelengths)
+
+
+def plan_text(rows: list[PlanRow]) -> str:
+    """Return the plan as a table."""
+    lines = [f"{'stage':<10} {'what':<20} {'needed':>10} {'total':>10}  why"]
+    lines += [f"{r.stage:<10} {r.what:<20} {r.needed:>10} {r.total:>10}  {r.reason}" for r in rows]
+    return "\n".join(lines)

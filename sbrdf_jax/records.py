@@ -1,0 +1,156 @@
+"""The records that stages hand to each other; the axis order is fixed here, once.
+
+Axes everywhere: theta_i, theta_o, phi_o, then wavelength or coefficient. Angles are in
+radians, wavelengths in nanometres, BRDF values in 1/sr. A record that holds numbers of
+a fit is a JAX pytree: its arrays may be traced, its other fields are static.
+"""
+
+import dataclasses
+import enum
+from typing import Any
+
+import jax
+import numpy as np
+
+
+class Status(enum.IntEnum):
+    """How one lane (a wavelength, or one coefficient of one incident angle) ended."""
+
+    OK = 0
+    MAX_STEPS = 1
+    NONFINITE = 2
+    SKIPPED = 3
+    CLAMPED = 4
+    NO_LOBE = 5
+
+
+STATUS_TEXT = {
+    Status.OK: "reached its tolerance",
+    Status.MAX_STEPS: "stopped at the step limit before its tolerance; raise the limit or the tolerance",
+    Status.NONFINITE: "not finite; look at the input of this lane",
+    Status.SKIPPED: "not computed, because nothing needs it",
+    Status.CLAMPED: "the lobe is narrower than the grid; its width was set to the narrowest that the grid shows",
+    Status.NO_LOBE: "the background alone explains it",
+}
+
+
+def pytree(*, static: tuple[str, ...] = ()):
+    """Class decorator: a frozen dataclass that JAX may trace, but for the fields `static`."""
+
+    def register(cls):
+        cls = dataclasses.dataclass(frozen=True)(cls)
+        data = [f.name for f in dataclasses.fields(cls) if f.name not in static]
+        return jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=list(static))
+
+    return register
+
+
+@dataclasses.dataclass(frozen=True)
+class RawSamples:
+    """A measurement as read: NumPy on the host, every row of the file, in file order.
+
+    Angles follow the project's convention: the azimuth of incidence is 0 and the mirror
+    direction lies at phi_o = pi. Values are what `quantity` says, after `input.scale`.
+    """
+
+    theta_i: np.ndarray  # [sample] rad
+    theta_o: np.ndarray  # [sample] rad
+    phi_o: np.ndarray  # [sample] rad, in [0, 2 pi)
+    wavelength_nm: np.ndarray  # [wavelength], increasing
+    value: np.ndarray  # [sample, wavelength] 1/sr
+    row: np.ndarray  # [sample] int, from 0 in file order
+    quantity: str  # "brdf", or "relative": proportional to it
+    source: str  # file name or "builtin:..."
+    source_format: str  # a name of `input.format`, or "builtin"
+    source_sha256: str
+    notes: tuple[str, ...] = ()  # what a reader should know of the file, a sentence each
+
+    @property
+    def num_samples(self) -> int:
+        """Number of samples (rows)."""
+        return len(self.theta_i)
+
+    def take(self, keep: np.ndarray) -> "RawSamples":
+        """Return the samples that a mask or index array keeps."""
+        return dataclasses.replace(
+            self,
+            theta_i=self.theta_i[keep],
+            theta_o=self.theta_o[keep],
+            phi_o=self.phi_o[keep],
+            value=self.value[keep],
+            row=self.row[keep],
+        )
+
+
+@pytree(static=("method", "window", "bilateral", "interpolate_theta_i"))
+class GriddedBRDF:
+    """The resampled field on the uniform grid, and what proves it.
+
+    phi_o runs from 0 to 2 pi inclusive. For method "paper" the nodes are the field: any
+    direction follows from them by eq. (5), under `window`. `interpolate_theta_i` is False
+    where fewer than 3 incident angles were measured: the theta_i axis is then the measured ones.
+    """
+
+    theta_i: Any  # [theta_i] rad
+    theta_o: Any  # [theta_o] rad
+    phi_o: Any  # [phi_o] rad
+    wavelength_nm: Any  # [wavelength]
+    brdf: Any  # [theta_i, theta_o, phi_o, wavelength] 1/sr
+    extrapolated: Any  # [theta_i, theta_o, phi_o] 0 measured nearby, 1 interpolated, 2 beyond the data
+    kkt_residual: Any  # [wavelength] relative, of the stored solution, in float64
+    num_steps: Any  # [wavelength]
+    status: Any  # [wavelength] Status
+    method: str = "paper"
+    window: str = "factor"
+    bilateral: bool = False
+    interpolate_theta_i: bool = True
+
+
+@pytree(static=("kind", "uniform"))
+class SpectralBasis:
+    """The functions of wavelength whose coefficients stand for a spectrum.
+
+    kind "fourier": eq. (11), coefficients a_0, a_1, b_1, a_2, b_2, ...; "cosine": the even
+    extension, c_0, c_1, ...; "identity": the samples themselves. The measured wavelengths
+    are kept, because they are the domain and, for "identity", the nodes.
+    """
+
+    wavelength_nm: Any  # [wavelength]
+    analysis: Any  # [wavelength, coefficient]: spectrum @ analysis = coefficients
+    synthesis: Any  # [coefficient, wavelength]: coefficients @ synthesis = spectrum
+    kind: str = "fourier"
+    uniform: bool = False  # wavelengths so nearly uniform that a series is encoded by an FFT
+
+
+@pytree(static=("window", "interpolate_theta_i"))
+class SpectralField:
+    """Coefficients of the spectrum at every node of the grid; between nodes as the grid itself is evaluated."""
+
+    theta_i: Any  # [theta_i] rad
+    theta_o: Any  # [theta_o] rad
+    phi_o: Any  # [phi_o] rad
+    coefficient: Any  # [theta_i, theta_o, phi_o, coefficient] 1/sr
+    basis: SpectralBasis
+    window: str = "factor"
+    interpolate_theta_i: bool = True
+
+
+@pytree(static=("max_degree", "interpolate_theta_i"))
+class CompactBRDF:
+    """Eq. (13) for every incident angle and coefficient: harmonics plus one lobe.
+
+    lobe_kind counts from 0 = none in the order of `lobes.LOBE_KINDS`. Between incident
+    angles the field is linear between the values at the neighbouring nodes.
+    """
+
+    theta_i: Any  # [theta_i] rad
+    basis: SpectralBasis
+    background: Any  # [theta_i, coefficient, harmonic] 1/sr
+    lobe_kind: Any  # [theta_i, coefficient] int, 0 = none
+    lobe_height: Any  # [theta_i, coefficient] 1/sr
+    lobe_width: Any  # [theta_i, coefficient] rad^2 or dimensionless
+    critical_angle: Any  # [theta_i, coefficient] rad, nan where there is no lobe
+    lobe_peak_theta_o: Any  # [theta_i] rad, at phi_o = pi
+    status: Any  # [theta_i, coefficient] Status
+    max_degree: int = 4
+    interpolate_theta_i: bool = True

@@ -1,0 +1,212 @@
+"""All figures of one result: which are drawn, from what, and what stands below each on the page."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sbrdf_jax.config import parse_config
+from sbrdf_jax.cutoff import CutoffSpectrum, measure_cutoff
+from sbrdf_jax.evaluation import evaluate_in_chunks
+from sbrdf_jax.records import GriddedBRDF, RawSamples
+from sbrdf_jax.report import curves, hemisphere, quality
+from sbrdf_jax.report.fine_grid import interpolate_finely, pick_incidences, ring_effect
+from sbrdf_jax.report.lobe_fits import fit_lobe_kinds
+from sbrdf_jax.report.style import save_figure, style_context
+from sbrdf_jax.store import RunResult
+from sbrdf_jax.summary import cleaning_counts
+
+
+class Drawing(NamedTuple):
+    """A figure on disk and the words that belong to it."""
+
+    path: Path
+    title: str
+    caption: str
+    warnings: tuple[str, ...] = ()
+
+
+class _Sketch(NamedTuple):
+    """A figure before it is written."""
+
+    name: str
+    figure: Any
+    title: str
+    caption: str
+    warnings: tuple[str, ...] = ()
+
+
+def draw_figures(result: RunResult, folder: Path, samples: RawSamples | None = None, *, prefix: str = "") -> list[Path]:
+    """Draw every figure that a result has the data for, as PNG.
+
+    Args:
+        result: The result.
+        folder: Existing folder for the files.
+        samples: The cleaned samples, for the figures that compare with them; None leaves these out.
+        prefix: Before each file name, where several results share the folder.
+
+    Returns:
+        The files, in the order of the page.
+    """
+    return [drawing.path for drawing in draw(result, folder, samples, prefix=prefix)]
+
+
+def draw(result: RunResult, folder: Path, samples: RawSamples | None = None, *, prefix: str = "") -> list[Drawing]:
+    """Draw as `draw_figures` does, and return each figure with its title and caption."""
+    drawings = []
+    with style_context():
+        for sketch in _sketches(result, samples):
+            path = save_figure(sketch.figure, Path(folder) / f"{prefix}{sketch.name}.png")
+            drawings.append(Drawing(path, sketch.title, sketch.caption, sketch.warnings))
+    return drawings
+
+
+def _sketches(result: RunResult, samples: RawSamples | None) -> Iterator[_Sketch]:
+    if result.gridded.method == "paper":  # other methods are not the interpolation of their nodes
+        yield from _of_interpolation(result, samples)
+    if result.field is not None:
+        yield _spectra(result)
+    yield from _of_quality(result)
+    if samples is not None:
+        spectra = measure_samples(samples, result.gridded)
+        if spectra:
+            yield _cutoff(spectra)
+
+
+def _of_interpolation(result: RunResult, samples: RawSamples | None) -> Iterator[_Sketch]:
+    grid = result.gridded
+    fine = interpolate_finely(grid)
+    effect = ring_effect(grid, fine)
+    yield _Sketch(
+        "plane_of_incidence",
+        curves.plane_of_incidence(fine, grid, samples),
+        "In the plane of incidence",
+        f"The resampled BRDF at {fine.wavelength.text} (the paper's figure 7): interpolation, nodes of the grid and, "
+        "where they are known, the samples beside the plane.",
+    )
+    numbers = (
+        f"Total variation over the hemisphere at {fine.incidences[0].text} incidence: {effect.plain:.4g} rad/sr "
+        f"without the window and {effect.windowed:.4g} rad/sr with it; straight lines between the nodes have "
+        f"{effect.nodes:.4g}."
+    )
+    yield _Sketch(
+        "color_maps",
+        hemisphere.color_maps(fine, grid, effect),
+        "In colour",
+        "The interpolated field without and with the window of eq. 17 (the paper's figures 8 and 9). Each incident "
+        f"angle has one exposure for both. {numbers}",
+    )
+    yield _Sketch(
+        "ring_effect",
+        curves.ring_curves(fine, grid, effect),
+        "The ring effect",
+        f"Eq. 5 with and without the window, through the same nodes. {numbers}",
+    )
+    if result.field is not None and result.compact is not None:
+        degrees = tuple(dict.fromkeys((1, result.compact.max_degree)))
+        fits = fit_lobe_kinds(result.field, grid, fine.incidences[0].index, degrees)
+        yield _Sketch(
+            "lobe_kinds",
+            curves.lobe_kinds(fine, fits),
+            "Three lobe kinds",
+            f"The original against the paper's representation with each lobe kind at {fine.wavelength.text} (its "
+            "figure 10). The paper reports 14.3, 14.3 and 11.5 % at L = 1 and below 4.5 % at L = 4, of its own sample.",
+        )
+
+
+def _spectra(result: RunResult) -> _Sketch:
+    grid = result.gridded
+    picked = [incidence.index for incidence in pick_incidences(grid)]
+    first, last = picked[0], picked[-1]
+    mirror = int(np.argmin(np.abs(np.asarray(grid.theta_o) - np.asarray(grid.theta_i)[last])))
+    half = (len(grid.phi_o) - 1) // 2
+    places = list(dict.fromkeys([(first, 0, 0), (last, mirror, half), (last, 0, 0)]))
+    return _Sketch(
+        "spectra",
+        curves.spectra(grid, result.field, result.compact, places),
+        "Spectra",
+        "Spectra of the grid, of their truncated series, and of the compact form (the paper's figure 11). A Fourier "
+        "series starts and ends at the same value, so a spectrum whose ends differ is missed there.",
+    )
+
+
+def _of_quality(result: RunResult) -> Iterator[_Sketch]:
+    grid, metrics = result.gridded, result.metrics
+    if "relative_error" in metrics:
+        yield _Sketch(
+            "errors",
+            quality.errors(grid, metrics),
+            "Errors of the compact form",
+            "Eq. 18 at every incident angle, at the nodes and at the midpoints between them, and what it is made of. "
+            "Squares of the parts add up to that of the whole, but for cross terms.",
+        )
+    yield _Sketch(
+        "coverage",
+        hemisphere.coverage_maps(grid),
+        "Coverage",
+        "Nodes with a sample within one step, nodes between samples, and nodes beyond the measured range, where the "
+        "values are extrapolated by the smoothness rows alone.",
+    )
+    if "albedo" in metrics:
+        absolute = result.input.get("quantity", "brdf") == "brdf"
+        yield _Sketch(
+            "albedo",
+            quality.albedo(grid, np.asarray(metrics["albedo"]), absolute=absolute),
+            "Albedo",
+            "The share of light that the grid reflects, for each incident angle. Above 1 it would create energy.",
+        )
+    yield _Sketch(
+        "solver",
+        quality.solver(grid, tolerance_of(result)),
+        "The solver's certificate",
+        "Relative KKT residual of every wavelength's non-negative least squares, of the stored solution.",
+    )
+    counts = cleaning_counts(result)
+    if counts and result.clean is not None:
+        yield _Sketch(
+            "cleaning",
+            quality.cleaning(counts, result.clean.num_rows),
+            "Cleaning",
+            "What was dropped, clipped, folded or flagged; flagged samples are kept.",
+        )
+
+
+def _cutoff(spectra: list[CutoffSpectrum]) -> _Sketch:
+    return _Sketch(
+        "cutoff",
+        quality.cutoff(spectra),
+        "Samples against the cut-off",
+        "The power of samples and residual over angular frequency (the paper's figures 2 to 5), found degree by degree "
+        "in harmonics that are made orthogonal on the samples, so that scattered sampling leaks nothing. What lies "
+        "beyond the cut-off is filtered if it is noise and aliased if it is signal.",
+        tuple(spectrum.warning for spectrum in spectra if spectrum.warning),
+    )
+
+
+def measure_samples(samples: RawSamples, grid: GriddedBRDF) -> list[CutoffSpectrum]:
+    """Measure samples and the residual of their fit against the cut-off of the grid."""
+    residual = None
+    if grid.method == "paper":
+        fitted = dataclasses.replace(grid, window="none")  # eq. (6) is fitted without the window
+        residual = samples.value - evaluate_in_chunks(fitted, samples.theta_i, samples.theta_o, samples.phi_o)
+    steps = [float(axis[1] - axis[0]) for axis in (grid.theta_o, grid.phi_o)]
+    return measure_cutoff(
+        samples.theta_i,
+        samples.theta_o,
+        samples.phi_o,
+        samples.value,
+        residual=residual,
+        theta_i_step=float(grid.theta_i[1] - grid.theta_i[0]) if grid.interpolate_theta_i else 0.0,
+        theta_o_step=steps[0],
+        phi_o_step=steps[1],
+    )
+
+
+def tolerance_of(result: RunResult) -> float | None:
+    """The tolerance that the result's config asked for, or None where there is no config."""
+    if not result.config:
+        return None
+    tolerance = parse_config(result.config, name="config of the result").resample.tolerance
+    return tolerance if isinstance(tolerance, float) else None

@@ -1,0 +1,90 @@
+"""Process-wide settings of JAX, made once by the entry points and never by library modules."""
+
+import contextlib
+import dataclasses
+import os
+from collections.abc import Iterator
+
+CACHE_VARIABLE = "SBRDF_COMPILE_CACHE"
+
+
+@dataclasses.dataclass
+class CompileClock:
+    """Seconds spent tracing, lowering and compiling while it was on, and how many programs were compiled."""
+
+    seconds: float = 0.0
+    num_compiled: int = 0
+
+    def _add(self, event: str, duration: float, **_details) -> None:
+        if event.startswith("/jax/core/compile/"):
+            self.seconds += duration
+            self.num_compiled += event.endswith("backend_compile_duration")
+
+
+_clocks: list[CompileClock] = []
+_listening = False
+
+
+@contextlib.contextmanager
+def compile_clock() -> Iterator[CompileClock]:
+    """Measure compilation inside the block, for the times of a stage to be told apart from it."""
+    _listen()
+    clock = CompileClock()
+    _clocks.append(clock)
+    try:
+        yield clock
+    finally:
+        _clocks.remove(clock)
+
+
+def set_up_jax() -> None:
+    """Switch on float64, and the persistent compile cache where `SBRDF_COMPILE_CACHE` names a folder.
+
+    The cache's folder is keyed by the jaxlib version and the processor's flags, because
+    compiled code of another is rejected at best.
+    """
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    folder = os.environ.get(CACHE_VARIABLE)
+    if folder:
+        jax.config.update("jax_compilation_cache_dir", os.path.join(folder, _machine_key()))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computes and stores a result."""
+    import platform
+    from importlib.metadata import version
+
+    packages = ("sbrdf-jax", "jax", "jaxlib", "numpy", "scipy", "h5py", "optimistix", "jaxopt", "colour-science")
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+
+
+def _listen() -> None:
+    global _listening
+    if not _listening:
+        import jax
+
+        def forward(event: str, duration: float, **details) -> None:
+            for clock in _clocks:
+                clock._add(event, duration, **details)
+
+        jax.monitoring.register_event_duration_secs_listener(forward)
+        _listening = True
+
+
+def _machine_key() -> str:
+    import hashlib
+    import platform
+    from importlib.metadata import version
+    from pathlib import Path
+
+    cpuinfo = Path("/proc/cpuinfo")
+    flags = ""
+    if cpuinfo.exists():
+        lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines()
+        flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    digest = hashlib.sha256((platform.machine() + flags).encode()).hexdigest()[:12]
+    return f"jaxlib-{version('jaxlib')}-{digest}"

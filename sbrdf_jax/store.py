@@ -1,0 +1,186 @@
+"""The result file: HDF5 names, units, scales and schema version; write and read.
+
+Angles are stored in degrees, wavelengths in nm, BRDF values in 1/sr. Every dataset has a
+`units` attribute and a dimension scale on each axis; big ones are chunked by theta_i. The
+group `compact` alone is enough to evaluate the compact form.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from sbrdf_jax.cleaning import CleanReport
+from sbrdf_jax.errors import UserError
+from sbrdf_jax.files import whole_file
+from sbrdf_jax.hdf5 import dataset, degrees, one_line_errors, read_datasets, read_mapping, scale, write_mapping
+from sbrdf_jax.layout import (
+    read_cleaning,
+    read_compact,
+    read_field,
+    read_grid,
+    write_cleaning,
+    write_compact,
+    write_field,
+    write_grid,
+)
+from sbrdf_jax.metrics import METRIC_AXES, METRIC_UNITS
+from sbrdf_jax.records import CompactBRDF, GriddedBRDF, SpectralField
+
+SCHEMA_NAME = "sbrdf-result"
+SCHEMA_VERSION = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class RunResult:
+    """All that a run found, and where it came from."""
+
+    gridded: GriddedBRDF
+    field: SpectralField | None = None
+    compact: CompactBRDF | None = None
+    metrics: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    clean: CleanReport | None = None
+    input: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # JSON values: source, quantity, notes, ...
+    validation: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)  # names with "/" are groups
+    plan: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # numbers, arrays, text; nested mappings
+    timing: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # seconds; nested mappings
+    warnings: tuple[str, ...] = ()
+    config: str = ""  # the resolved YAML
+    source_sha256: str = ""
+    created_utc: str = ""
+    versions: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+
+def save(path: str | os.PathLike, result: RunResult) -> None:
+    """Write a result so that a kill at any moment leaves the whole file or none under its name.
+
+    Raises:
+        UserError: the path cannot be written.
+    """
+    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+        write_result(file, result)
+
+
+def write_result(file: h5py.File, result: RunResult) -> None:
+    """Write every group of a result into an open, empty file."""
+    file.attrs["schema_name"] = SCHEMA_NAME
+    file.attrs["schema_version"] = SCHEMA_VERSION
+    file.attrs["config"] = result.config
+    file.attrs["config_sha256"] = hashlib.sha256(result.config.encode()).hexdigest()
+    file.attrs["source_sha256"] = result.source_sha256
+    file.attrs["created_utc"] = result.created_utc
+    file.attrs["versions"] = json.dumps(dict(result.versions), sort_keys=True)
+    file.attrs["warnings"] = json.dumps(list(result.warnings))
+    write_grid(file.create_group("grid"), result.gridded)
+    if result.field is not None:
+        write_field(file.create_group("spectral"), result.field, file["grid"])
+    if result.compact is not None:
+        write_compact(file.create_group("compact"), result.compact)
+    write_input(file.create_group("input"), result)
+    write_metrics(file.create_group("metrics"), result, file["grid"])
+    if result.validation:
+        write_validation(file.create_group("validation"), result.validation, file["grid"])
+    write_mapping(file.create_group("plan"), result.plan, "1")
+    write_mapping(file.create_group("timing"), result.timing, "s")
+
+
+def write_input(group: h5py.Group, result: RunResult) -> None:
+    """Write what came in, as attributes, and the cleaning report below `cleaning`."""
+    for name, value in result.input.items():
+        group.attrs[name] = json.dumps(value)
+    if result.clean is not None:
+        write_cleaning(group.create_group("cleaning"), result.clean)
+
+
+def write_metrics(group: h5py.Group, result: RunResult, grid: h5py.Group) -> None:
+    """Write every metric with the axes and the unit that `metrics` names for it."""
+    theta_i = np.asarray(result.gridded.theta_i)
+    axes = {"theta_i": grid["theta_i_deg"], "wavelength": grid["wavelength_nm"]}
+    if "relative_error_between_theta_i" in result.metrics:
+        midway = degrees((theta_i[:-1] + theta_i[1:]) / 2)
+        axes["theta_i_between"] = scale(group, "theta_i_between_deg", midway, "deg")
+    for name, value in result.metrics.items():
+        default = ("theta_i",) * np.ndim(value)
+        names = METRIC_AXES.get(name, default)
+        dataset(group, name, value, METRIC_UNITS.get(name, "1"), [axes[axis] for axis in names])
+
+
+def write_validation(group: h5py.Group, validation: Mapping[str, np.ndarray], grid: h5py.Group) -> None:
+    """Write held-out predictions, a row for each input row in file order."""
+    row = scale(group, "row", np.arange(len(next(iter(validation.values())))), "1")
+    for name, value in validation.items():
+        axes = [row, grid["wavelength_nm"]][: np.ndim(value)]
+        dataset(group, name, value, "1/sr" if np.ndim(value) == 2 else "1", axes)
+
+
+@contextlib.contextmanager
+def open_result(path: str | os.PathLike):
+    """Open a result for reading after a look at its schema.
+
+    Raises:
+        UserError: no such file, not an HDF5 file, not a result, or written by a newer version.
+    """
+    if not Path(path).is_file():
+        raise UserError(f"{path}: no such file, expected a result of sbrdf_jax")
+    if not h5py.is_hdf5(path):
+        raise UserError(f"{path}: not an HDF5 file or cut off, expected a result of sbrdf_jax")
+    with h5py.File(path, "r") as file:
+        found = file.attrs.get("schema_name")
+        if found != SCHEMA_NAME:
+            raise UserError(f"{path}: schema_name: found {found!r}, expected {SCHEMA_NAME!r}: this is not a result")
+        version = int(file.attrs["schema_version"])
+        if version > SCHEMA_VERSION:
+            raise UserError(
+                f"{path}: schema_version: found {version}, expected {SCHEMA_VERSION} or older: "
+                "it was written by a newer sbrdf_jax"
+            )
+        yield file
+
+
+@one_line_errors
+def load(path: str | os.PathLike) -> RunResult:
+    """Read a whole result.
+
+    Raises:
+        UserError: as `open_result`, or the file is damaged.
+    """
+    with open_result(path) as file:
+        gridded = read_grid(file["grid"])
+        compact = read_compact(file["compact"]) if "compact" in file else None
+        return RunResult(
+            gridded=gridded,
+            field=read_field(file["spectral"], gridded) if "spectral" in file else None,
+            compact=compact,
+            metrics=read_datasets(file["metrics"]),
+            clean=read_cleaning(file["input/cleaning"]) if "cleaning" in file["input"] else None,
+            input={name: json.loads(value) for name, value in file["input"].attrs.items()},
+            validation=read_datasets(file["validation"]) if "validation" in file else {},
+            plan=read_mapping(file["plan"]),
+            timing=read_mapping(file["timing"]),
+            warnings=tuple(json.loads(file.attrs["warnings"])),
+            config=str(file.attrs["config"]),
+            source_sha256=str(file.attrs["source_sha256"]),
+            created_utc=str(file.attrs["created_utc"]),
+            versions=json.loads(file.attrs["versions"]),
+        )
+
+
+@one_line_errors
+def load_stage(path: str | os.PathLike, stage: str) -> GriddedBRDF | CompactBRDF:
+    """Read what evaluation of one stage needs, "grid" or "compact", and nothing else.
+
+    Raises:
+        UserError: as `load`, or the result has no such stage.
+    """
+    readers = {"grid": read_grid, "compact": read_compact}
+    with open_result(path) as file:
+        if stage not in file:
+            raise UserError(f"{path}: stage {stage}: not in this result, found {', '.join(file)}")
+        return readers[stage](file[stage])

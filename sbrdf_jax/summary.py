@@ -1,0 +1,191 @@
+"""What a result says in tables: what came in, what was done, errors per incident angle, seconds per stage.
+
+The same tables are printed at the end of a run and shown on the report's page.
+"""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from sbrdf_jax.lobes import LOBE_KINDS
+from sbrdf_jax.progress import format_seconds
+from sbrdf_jax.records import STATUS_TEXT, Status
+from sbrdf_jax.store import RunResult
+
+ERROR_COLUMNS = (
+    ("relative_error", "eta %", 100.0),
+    ("relative_error_between", "between %", 100.0),
+    ("error_spectral", "spectral %", 100.0),
+    ("error_background", "background %", 100.0),
+    ("error_lobe", "lobe %", 100.0),
+    ("median_relative_error", "median %", 100.0),
+    ("delta_e_median", "Delta E", 1.0),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Rows of text under a title; the first column is a name, the others are right-aligned where `numeric`."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+    numeric: bool = False
+
+
+def summary_text(result: RunResult) -> str:
+    """Return the whole summary as plain text."""
+    tables = [input_table(result), done_table(result), error_table(result), time_table(result)]
+    parts = [table_text(table) for table in tables if table.rows]
+    if result.warnings:
+        parts.append("Warnings\n" + "\n".join(f"  {warning}" for warning in result.warnings))
+    return "\n\n".join(parts)
+
+
+def table_text(table: Table) -> str:
+    """Return one table as aligned text."""
+    lines = [row for row in (table.header, *table.rows) if any(row)]
+    widths = [max(len(row[k]) for row in lines) for k in range(len(table.rows[0]))]
+    text = [table.title]
+    for row in lines:
+        cells = [row[0].ljust(widths[0])]
+        for cell, width in zip(row[1:], widths[1:], strict=True):
+            cells.append(cell.rjust(width) if table.numeric else cell.ljust(width))
+        text.append("  " + "  ".join(cells).rstrip())
+    return "\n".join(text + ([f"  {table.note}"] if table.note else []))
+
+
+def input_table(result: RunResult) -> Table:
+    """What came in, and what cleaning made of it."""
+    rows = [(name.replace("_", " "), str(result.input[name])) for name in ("source", "format") if name in result.input]
+    if "quantity" in result.input:
+        unit = "BRDF [1/sr]" if result.input["quantity"] == "brdf" else "proportional to a BRDF"
+        rows.append(("values", unit))
+    wavelength = np.asarray(result.gridded.wavelength_nm)
+    rows.append(("wavelengths", f"{len(wavelength)}, {wavelength[0]:g} to {wavelength[-1]:g} nm"))
+    if result.clean is not None:
+        rows.append(("samples", f"{result.clean.num_kept} of {result.clean.num_rows} kept"))
+        for done, name, count in cleaning_counts(result):
+            rows.append((done, f"{count} {name}"))
+    rows += [("note", note) for note in result.input.get("notes", ())]
+    return Table("What came in", ("", ""), tuple(rows))
+
+
+def cleaning_counts(result: RunResult) -> list[tuple[str, str, int]]:
+    """(what was done, flag, number of samples) of every flag that some sample has."""
+    if result.clean is None:
+        return []
+    return [(entry.action, entry.name, entry.rows) for entry in result.clean.entries if entry.rows]
+
+
+def done_table(result: RunResult) -> Table:
+    """What was done: the grid and its certificate, the encoding, the compact form and its lanes."""
+    grid = result.gridded
+    sizes = " x ".join(str(n) for n in np.shape(grid.brdf))
+    folded = "phi_o folded" if grid.bilateral else "phi_o all round"
+    axes = f"{sizes} (theta_i, theta_o, phi_o, wavelength)"
+    rows = [("grid", f"{axes}, method {grid.method}, {folded}, window {grid.window}")]
+    if not grid.interpolate_theta_i:
+        rows.append(("", "theta_i as measured, nothing interpolated over it"))
+    residual, steps = np.nanmax(np.asarray(grid.kkt_residual)), int(np.max(grid.num_steps))
+    certificate = f"KKT residual at most {residual:.1e}, at most {steps} steps"
+    rows.append(("solver", f"{certificate}; {count_statuses(grid.status)}"))
+    rows.append(("nodes", coverage_text(grid.extrapolated)))
+    if result.field is not None:
+        basis = result.field.basis
+        rows.append(("spectra", f"{np.shape(basis.synthesis)[0]} coefficients, basis {basis.kind}"))
+    if result.compact is not None:
+        compact = result.compact
+        kinds = Counter(LOBE_KINDS[int(kind)] for kind in np.ravel(compact.lobe_kind))
+        lobes = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+        rows.append(("compact", f"harmonics up to L = {compact.max_degree}; lobes: {lobes}"))
+        rows.append(("lanes", count_statuses(compact.status)))
+    ratios = [(name, text) for name, text in RATIOS if name in result.metrics]
+    if ratios:
+        rows.append(("size", ", ".join(f"{float(result.metrics[name]):.4g}:1 {text}" for name, text in ratios)))
+    for stage, suffix in (("grid", "_grid"), ("compact", "")):
+        if f"negative_share{suffix}" in result.metrics:
+            share, depth = (float(result.metrics[f"negative_{what}{suffix}"]) for what in ("share", "depth"))
+            rows.append((f"{stage} < 0", f"{100 * share:.2g} % of values off the nodes, deepest {-depth:.2g} 1/sr"))
+    return Table("What was done", ("", ""), tuple(rows))
+
+
+RATIOS = (
+    ("compression_ratio", "with every stored number"),
+    ("compression_ratio_paper", "as the paper counts (mirror images and pole copies of the data counted)"),
+)
+
+
+def coverage_text(extrapolated) -> str:
+    """Shares of nodes by what stands behind them."""
+    flags = np.asarray(extrapolated)
+    names = ("measured nearby", "interpolated", "beyond the measured range")
+    return ", ".join(f"{100 * (flags == k).mean():.3g} % {name}" for k, name in enumerate(names))
+
+
+def count_statuses(status) -> str:
+    """Count lanes by how they ended: "212 ok, 35 no_lobe"."""
+    counts = Counter(Status(int(value)).name.lower() for value in np.ravel(np.asarray(status)))
+    return ", ".join(f"{count} {name}" for name, count in counts.most_common())
+
+
+def error_table(result: RunResult) -> Table:
+    """Errors of the compact form for every incident angle, however bad."""
+    columns = [column for column in ERROR_COLUMNS if column[0] in result.metrics]
+    flags = np.asarray(result.gridded.extrapolated)
+    rows = []
+    for index, angle in enumerate(np.degrees(result.gridded.theta_i)) if columns else ():
+        star = " *" if (flags[index] == 2).all() else ""
+        values = [_number(scale * float(result.metrics[name][index])) for name, _, scale in columns]
+        rows.append((f"{angle:.4g}{star}", *values))
+    overall = [result.metrics.get(f"{name}_overall") for name, _, _ in columns]
+    if any(value is not None for value in overall):
+        texts = [
+            "" if value is None else _number(scale * float(value))
+            for value, (_, _, scale) in zip(overall, columns, strict=True)
+        ]
+        rows.append(("all", *texts))
+    note = "* no sample at this incident angle: extrapolated" if any("*" in row[0] for row in rows) else ""
+    header = ("theta_i [deg]", *(title for _, title, _ in columns))
+    return Table("Errors of the compact form against the grid, per incident angle", header, tuple(rows), note, True)
+
+
+def status_table(result: RunResult) -> Table:
+    """How every lane ended, with what it means."""
+    rows = []
+    lanes = {"wavelengths of the grid": result.gridded.status}
+    if result.compact is not None:
+        lanes["lanes of the compact form"] = result.compact.status
+    for name, status in lanes.items():
+        values, counts = np.unique(np.asarray(status), return_counts=True)
+        for value, count in zip(values, counts, strict=True):
+            known = Status(int(value))
+            rows.append((f"{count} {name}", known.name.lower(), STATUS_TEXT[known]))
+    return Table("Statuses", ("", "status", "meaning"), tuple(rows))
+
+
+def time_table(result: RunResult) -> Table:
+    """Seconds per stage, compilation apart."""
+    stages = {name: value for name, value in result.timing.items() if isinstance(value, Mapping) and "total" in value}
+    columns = ("total", "compile", "run")
+    rows = [(name.replace("_", " "), *(_seconds(stage.get(c)) for c in columns)) for name, stage in stages.items()]
+    if rows:
+        rows.append(("all", *(_seconds(_total(stages.values(), column)) for column in columns)))
+    return Table("Time", ("stage", *columns), tuple(rows), numeric=True)
+
+
+def _total(stages: Iterable[Mapping], column: str) -> float:
+    return sum(float(stage.get(column, 0.0)) for stage in stages)
+
+
+def _seconds(value) -> str:
+    return "" if value is None else format_seconds(float(value))
+
+
+def _number(value: float) -> str:
+    if not np.isfinite(value):
+        return "-" if np.isnan(value) else "inf"
+    return f"{value:.3g}" if abs(value) >= 1e-3 or value == 0 else f"{value:.1e}"

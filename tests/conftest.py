@@ -1,0 +1,43 @@
+"""What every test runs under: x64, strict dtypes and ranks, array annotations enforced, the measured data by name."""
+
+import os
+from pathlib import Path
+
+import jax
+import jaxtyping
+import numpy as np
+import pytest
+
+# Before the first import of the package: annotations of shape, dtype and type are checked at every call.
+jaxtyping.install_import_hook("sbrdf_jax", "beartype.beartype")
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+ROOT = Path(__file__).resolve().parent.parent
+SHARED = ROOT.parent / "shared"  # measured data that are not part of the repository
+IN_CI = os.environ.get("CI", "").lower() in ("1", "true")
+
+
+def shared_file(name: str) -> Path:
+    """Path of a measured file below `SHARED`; skips the test by name where it is absent, fails in CI."""
+    path = SHARED / name
+    if path.exists():
+        return path
+    message = f"{path.parent.name}/{path.name}: no such measured file below {SHARED}"
+    if IN_CI:
+        pytest.fail(f"{message}, and CI must have it")
+    pytest.skip(message)
+
+
+@pytest.fixture
+def shared():
+    """The function `shared_file`: `shared("data/cornell/cayman.brdf")` is a path, or the test skips."""
+    return shared_file
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A random generator with a fixed seed, new for each test."""
+    return np.random.default_rng(20240607)
