@@ -6,12 +6,11 @@ round a small one, and a method that weighs samples decides for itself what a fl
 
 import dataclasses
 import enum
-from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from sbrdf_jax.coverage import OFF_PLANE, Coverage, cluster_incidences, find_coverage
+from sbrdf_jax.coverage import Coverage, cluster_incidences, find_coverage
 from sbrdf_jax.dropouts import find_dropouts
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.formats.table import MIN_SAMPLES
@@ -19,6 +18,8 @@ from sbrdf_jax.records import RawSamples
 
 HORIZON_TOLERANCE = 1e-5  # rad; rounding in a text file puts 90 degrees at 1.5708
 SAME_DIRECTION = 1e-6  # rad; the last digit that text files keep
+HALF_TURN_TOLERANCE = 1e-4  # rad; text files put pi at 3.1416
+MAX_VALUE = 1e30  # 1/sr; no measurement is larger, and squares stay finite
 NUM_EXAMPLES = 3
 
 
@@ -38,7 +39,7 @@ class Flag(enum.IntFlag):
 
 DROPPED = Flag.NONFINITE | Flag.BELOW_HORIZON
 ACTION_AND_REASON = {
-    Flag.NONFINITE: ("dropped", "an angle or a value is not a finite number"),
+    Flag.NONFINITE: ("dropped", "an angle or a value is not a finite number, or beyond 1e30"),
     Flag.BELOW_HORIZON: ("dropped", "theta_o is above 90 degrees: below the horizon"),
     Flag.CLIPPED: ("clipped", "theta_i or theta_o was 90 degrees but for rounding, and was set to it"),
     Flag.NEGATIVE: ("flagged", "some value is negative: noise round a small value, kept"),
@@ -115,7 +116,7 @@ def clean(raw: RawSamples, *, bilateral: bool | Literal["auto"] = "auto", method
     Raises:
         UserError: fewer than 4 samples or no positive value are left.
     """
-    finite = np.isfinite(raw.value)
+    finite = np.abs(raw.value) <= MAX_VALUE
     angles_finite = np.isfinite(raw.theta_i) & np.isfinite(raw.theta_o) & np.isfinite(raw.phi_o)
     dead = np.mean(finite, axis=0) < 0.5
     flag = np.zeros(raw.num_samples, np.uint16)
@@ -151,7 +152,7 @@ def clean(raw: RawSamples, *, bilateral: bool | Literal["auto"] = "auto", method
     coverage = find_coverage(kept)
     folded = resolve_bilateral(bilateral, method, coverage)
     if folded:
-        mark(Flag.FOLDED, where[(kept.phi_o > np.pi + OFF_PLANE) & (kept.theta_o > 0)])
+        mark(Flag.FOLDED, where[(kept.phi_o > np.pi + HALF_TURN_TOLERANCE) & (kept.theta_o > 0)])
     report = CleanReport(
         flag=flag,
         entries=tuple(_entry(bit, flag, values[bit], raw) for bit in ACTION_AND_REASON),
@@ -162,15 +163,6 @@ def clean(raw: RawSamples, *, bilateral: bool | Literal["auto"] = "auto", method
         coverage=coverage,
     )
     return CleanResult(kept, report)
-
-
-def stored_report(mapping: Mapping[str, Any]) -> CleanReport:
-    """Rebuild a report from the nested mapping of `dataclasses.asdict`, as a result stores it."""
-    coverage = dict(mapping["coverage"])
-    for name in ("theta_o_range_deg", "covered", "missing"):
-        coverage[name] = tuple(coverage[name])
-    entries = tuple(CleanEntry(**{**entry, "examples": tuple(entry["examples"])}) for entry in mapping["entries"])
-    return CleanReport(**{**mapping, "entries": entries, "coverage": Coverage(**coverage)})
 
 
 def resolve_bilateral(setting: bool | Literal["auto"], method: str, coverage: Coverage) -> bool:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from sbrdf_jax.errors import UserError
 
-UNEXPECTED, WRONG_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
+UNEXPECTED, WRONG_INPUT, SOME_LANES_FAILED, INTERRUPTED, TERMINATED = 1, 2, 3, 130, 143
 
 COMMANDS = {
     "run": "from a measurement to a result, as a config says",

@@ -107,11 +107,11 @@ def delta_e_2000(brdf_a: np.ndarray, brdf_b: np.ndarray, matching: ColourMatchin
     import colour
 
     lab_a, lab_b = (xyz_to_lab(brdf_to_xyz(brdf, matching), matching) for brdf in (brdf_a, brdf_b))
-    return colour.delta_E(lab_a, lab_b, method="CIE 2000")
+    return np.asarray(colour.delta_E(lab_a, lab_b, method="CIE 2000"))
 
 
 def brdf_to_srgb(
-    brdf: np.ndarray, matching: ColourMatching, *, exposure: float = 1.0, gamma: bool = True
+    brdf: np.ndarray, matching: ColourMatching, *, exposure: float | int = 1.0, gamma: bool = True
 ) -> np.ndarray:
     """sRGB [..., 3] of BRDF spectra [..., wavelength] in 1/sr, for pictures.
 
@@ -162,7 +162,7 @@ def _has_e308_rule(wavelength_nm: np.ndarray) -> bool:
         return False
     steps = np.diff(wavelength_nm)
     grain = 10.0 if steps[0] >= 10 else steps[0]
-    return steps[0] in E308_INTERVALS and bool(np.all(steps == steps[0])) and wavelength_nm[0] % grain == 0
+    return bool(steps[0] in E308_INTERVALS and np.all(steps == steps[0]) and wavelength_nm[0] % grain == 0)
 
 
 def _unit_spectra_weights(wavelength_nm: np.ndarray, tables: tuple[Any, Any]) -> np.ndarray:

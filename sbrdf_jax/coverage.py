@@ -19,11 +19,11 @@ HOLE = np.radians(5.0)  # round the mirror or the incidence direction
 
 @dataclasses.dataclass(frozen=True)
 class Coverage:
-    """What was measured, as numbers and as lines for a user; stored as it is, so in degrees."""
+    """What was measured, as numbers and as lines for a user."""
 
-    theta_i_deg: np.ndarray  # [incidence] distinct, increasing
+    theta_i: np.ndarray  # [incidence] rad, distinct, increasing
     count: np.ndarray  # [incidence] samples of each
-    theta_o_range_deg: tuple[float, float]
+    theta_o_range: tuple[float, float]  # rad
     covers_both_half_planes: bool  # phi_o on both sides of the plane of incidence
     covered: tuple[str, ...]  # a line each
     missing: tuple[str, ...]  # a line each
@@ -46,7 +46,9 @@ def cluster_incidences(
         start = int(np.searchsorted(angle, angle[start] + SAME_INCIDENCE, "right"))
     index = np.empty(len(angle), int)
     index[order] = np.searchsorted(np.array(starts, int), np.arange(len(angle)), "right") - 1
-    return np.bincount(index, theta_i) / np.bincount(index), index
+    first = angle[starts]
+    # the mean as an offset, so that equal angles come back exactly
+    return first + np.bincount(index, theta_i - first[index]) / np.bincount(index), index
 
 
 def find_coverage(samples: RawSamples) -> Coverage:
@@ -82,8 +84,7 @@ def find_coverage(samples: RawSamples) -> Coverage:
     if not halves.any():
         missing.append("everything off the plane of incidence")
     missing += [*_missing_azimuth(samples, deg), *_holes(samples, theta_i, index, deg)]
-    range_deg = (float(np.degrees(theta_o_range[0])), float(np.degrees(theta_o_range[1])))
-    return Coverage(np.degrees(theta_i), count, range_deg, both, covered, tuple(missing))
+    return Coverage(theta_i, count, theta_o_range, both, covered, tuple(missing))
 
 
 def _side(samples: RawSamples) -> np.ndarray:

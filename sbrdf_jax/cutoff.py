@@ -12,7 +12,7 @@ sampling is (an ordinary periodogram leaks there), the powers add up to the samp
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -47,20 +47,40 @@ class CutoffSpectrum:
         return bool(self.degree[-1] >= self.cutoff)
 
     @property
-    def warning(self) -> str:
-        """A sentence where the step aliases the lobe, else an empty text."""
-        where = f"theta_i {np.degrees(self.theta_i):.4g} deg"
-        share = f"{100 * self.share_above:.2g} % of the samples' root mean square"
-        edge = "the cut-off" if self.is_resolved else f"degree {self.degree[-1]}, the last that they resolve"
-        if self.steps_per_half_width < ALIAS_STEPS:
-            return (
-                f"{where}: the lobe's half width is {np.degrees(self.half_width):.2g} deg, "
-                f"{self.steps_per_half_width:.2f} steps of the grid where {ALIAS_STEPS:g} are needed; "
-                f"{share} lies above {edge}"
-            )
-        if self.share_above > ALIAS_SHARE:
-            return f"{where}: {share} lies above {edge}: the step aliases the signal, or the noise is that large"
-        return ""
+    def is_narrow(self) -> bool:
+        """Whether the lobe is narrower than the step can carry."""
+        return bool(self.steps_per_half_width < ALIAS_STEPS)
+
+    @property
+    def is_aliased(self) -> bool:
+        """Whether the step loses a notable part of the samples: signal that it aliases, or noise as large."""
+        return self.share_above > ALIAS_SHARE
+
+
+def cutoff_warnings(spectra: Sequence[CutoffSpectrum]) -> list[str]:
+    """Say in a sentence or two where the step of the grid aliases the lobe; nothing where it does not."""
+    narrow = [spectrum for spectrum in spectra if spectrum.is_narrow]
+    aliased = [spectrum for spectrum in spectra if spectrum.is_aliased]
+    warnings = []
+    if narrow:
+        worst = min(narrow, key=lambda spectrum: spectrum.steps_per_half_width)
+        warnings.append(
+            f"the grid is coarse for the lobe at theta_i {_angles(narrow)} deg: at {_angles([worst])} deg the half "
+            f"width is {np.degrees(worst.half_width):.2g} deg, {worst.steps_per_half_width:.2f} steps where "
+            f"{ALIAS_STEPS:g} are needed"
+        )
+    if aliased:
+        worst = max(aliased, key=lambda spectrum: spectrum.share_above)
+        edge = "the cut-off" if worst.is_resolved else "what the samples resolve"
+        warnings.append(
+            f"the step aliases the signal, or the noise is as large, at theta_i {_angles(aliased)} deg: at "
+            f"{_angles([worst])} deg {100 * worst.share_above:.2g} % of the samples' root mean square lies above {edge}"
+        )
+    return warnings
+
+
+def _angles(spectra: Sequence[CutoffSpectrum]) -> str:
+    return ", ".join(f"{np.degrees(spectrum.theta_i):.3g}" for spectrum in spectra)
 
 
 def hemisphere_modes(theta: np.ndarray, phi: np.ndarray) -> Iterator[np.ndarray]:

@@ -46,7 +46,10 @@ def find_dropouts(samples: RawSamples, incidence: Int[np.ndarray, " sample"]) ->
         noise = spectral_noise(value)
         if noise > 0:
             level = np.log(np.maximum(value, 0) + noise).mean(axis=1)
-            mask[member] = _low(level, _neighbours(samples.theta_o[member], samples.phi_o[member]))
+            start, index = _neighbours(samples.theta_o[member], samples.phi_o[member])
+            if _may_be_deep(level, start, index):
+                bounds = zip(start[:-1], start[1:], strict=True)
+                mask[member] = _low(level, [index[a:b].tolist() for a, b in bounds])
     return mask
 
 
@@ -73,40 +76,50 @@ def spectral_noise(value: Float[np.ndarray, "sample wavelength"]) -> float:
     return max(1.4826 * float(np.median(second_difference)) / np.sqrt(6), 1e-5 * stand_in)
 
 
-def _low(level: np.ndarray, neighbours: list[np.ndarray]) -> np.ndarray:
+def _may_be_deep(level: np.ndarray, start: np.ndarray, index: np.ndarray) -> bool:
+    """Whether some local minimum may be the floor of a deep basin; spares the search where data are smooth."""
+    some = np.diff(start) > 0
+    below = level[some]
+    lowest, highest = (f.reduceat(level[index], start[:-1][some]) for f in (np.minimum, np.maximum))
+    # with as many neighbours as a basin has samples, one of them lies on its rim
+    enclosed = np.diff(start)[some] < MAX_TOGETHER
+    return bool(np.any((below <= lowest) & (enclosed | (highest - below > np.log(MIN_FACTOR)))))
+
+
+def _low(level: np.ndarray, neighbours: list[list[int]]) -> np.ndarray:
     """Mask of the samples that lie deep in a basin, and of those half in its shadow."""
     low = np.zeros(len(level), bool)
     for members, rim_level in _basins(level, neighbours):
         deep = [m for m in members if rim_level - level[m] > np.log(MIN_FACTOR)]
-        around = {int(k) for m in members for k in neighbours[m]} - set(members)
+        around = {k for m in members for k in neighbours[m]} - set(members)
         if not deep or len(around) < MIN_NEIGHBOURS:
             continue  # the end of a row of samples: one neighbour proves nothing
         low[deep] = True
-        for edge in {int(k) for m in deep for k in neighbours[m]} - set(deep):
+        for edge in {k for m in deep for k in neighbours[m]} - set(deep):
             others = [k for k in neighbours[edge] if k not in deep]
             if len(others) >= MIN_NEIGHBOURS and np.median(level[others]) - level[edge] > np.log(EDGE_FACTOR):
                 low[edge] = True
     return low
 
 
-def _basins(level: np.ndarray, neighbours: list[np.ndarray]) -> list[tuple[list[int], float]]:
+def _basins(level: np.ndarray, neighbours: list[list[int]]) -> list[tuple[list[int], float]]:
     """Return the basins of at most `MAX_TOGETHER` samples, each with the level at which it overflows.
 
     Samples are flooded from the lowest up; a basin is closed by the sample that joins it to a
     larger one.
     """
-    parent = np.full(len(level), -1)
+    parent = [-1] * len(level)
     members: dict[int, list[int] | None] = {}  # by root; None where there are too many
     closed = []
 
-    def root(k: int) -> int:
+    def root(k):
         while parent[k] != k:
             parent[k] = parent[parent[k]]
             k = parent[k]
         return k
 
-    for sample in map(int, np.argsort(level, kind="stable")):
-        joined = {root(int(k)) for k in neighbours[sample] if parent[k] >= 0}
+    for sample in np.argsort(level, kind="stable").tolist():
+        joined = {root(k) for k in neighbours[sample] if parent[k] >= 0}
         parent[sample] = sample
         basins = [members.pop(r) for r in joined]
         for r in joined:
@@ -120,8 +133,11 @@ def _basins(level: np.ndarray, neighbours: list[np.ndarray]) -> list[tuple[list[
     return closed
 
 
-def _neighbours(theta_o: np.ndarray, phi_o: np.ndarray) -> list[np.ndarray]:
-    """Return the neighbours of each direction: by triangulation, or along a scan in one plane."""
+def _neighbours(theta_o: np.ndarray, phi_o: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (start, index): the neighbours of direction k are index[start[k] : start[k + 1]].
+
+    By triangulation, or along a scan in one plane.
+    """
     radius = 2 * np.sin(theta_o / 2)  # equal-area
     point = np.stack([radius * np.cos(phi_o), radius * np.sin(phi_o)], axis=1)
     centred = point - point.mean(axis=0)
@@ -129,9 +145,7 @@ def _neighbours(theta_o: np.ndarray, phi_o: np.ndarray) -> list[np.ndarray]:
     count = len(point)
     if spread[1] <= 1e-3 * spread[0]:  # all in one plane: two to either side
         position = np.argsort(centred @ axes[0], kind="stable")
-        result = [np.empty(0, int)] * count
-        for k, sample in enumerate(position):
-            result[sample] = position[[n for n in (k - 2, k - 1, k + 1, k + 2) if 0 <= n < count]]
-        return result
-    start, index = Delaunay(point).vertex_neighbor_vertices
-    return [index[start[k] : start[k + 1]] for k in range(count)]
+        near = np.argsort(position)[:, None] + np.array([-2, -1, 1, 2])
+        inside = (near >= 0) & (near < count)
+        return np.concatenate([[0], np.cumsum(inside.sum(axis=1))]), position[near[inside]]
+    return Delaunay(point).vertex_neighbor_vertices

@@ -60,11 +60,12 @@ def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
     return Prepared(cleaned, grid, basis, rows, tuple(warnings))
 
 
-def process(raw: RawSamples, options: RunOptions, progress: Progress) -> RunResult:
+def process(raw: RawSamples, ready: Prepared, options: RunOptions, progress: Progress) -> RunResult:
     """Run every stage on one measurement.
 
     Args:
         raw: All rows of a file.
+        ready: What `prepare` made of it.
         options: Resolved options.
         progress: Told of each stage.
 
@@ -72,11 +73,7 @@ def process(raw: RawSamples, options: RunOptions, progress: Progress) -> RunResu
         The result, but for what only its caller knows: config text, time of creation, versions.
     """
     timing: dict[str, dict[str, float]] = {}
-    with _timed(progress, timing, "clean"):
-        ready = prepare(raw, options)
-        samples, report = ready.cleaned.samples, ready.cleaned.report
-        progress.update(f"{report.num_kept} of {report.num_rows} samples kept")
-
+    samples, report = ready.cleaned.samples, ready.cleaned.report
     with _timed(progress, timing, "resample"):
         gridded = resample(
             samples,

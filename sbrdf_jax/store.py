@@ -184,3 +184,22 @@ def load_stage(path: str | os.PathLike, stage: str) -> GriddedBRDF | CompactBRDF
         if stage not in file:
             raise UserError(f"{path}: stage {stage}: not in this result, found {', '.join(file)}")
         return readers[stage](file[stage])
+
+
+def describe(path: str | os.PathLike) -> list[str]:
+    """Describe a result in lines for a user: what the file is, then the tables of its summary.
+
+    Raises:
+        UserError: as `load`.
+    """
+    from sbrdf_jax.summary import summary_text  # it formats what this module stores
+
+    result = load(path)
+    versions = ", ".join(f"{name} {version}" for name, version in result.versions.items())
+    head = [
+        f"{path}: {SCHEMA_NAME}, schema {SCHEMA_VERSION}, {Path(path).stat().st_size / 2**20:.1f} MiB",
+        f"created {result.created_utc or 'at an unknown time'} with {versions or 'unknown versions'}",
+        f"source sha256 {result.source_sha256 or 'unknown'}",
+        "",
+    ]
+    return head + summary_text(result).splitlines()

@@ -69,7 +69,7 @@ def input_table(result: RunResult) -> Table:
     if result.clean is not None:
         rows.append(("samples", f"{result.clean.num_kept} of {result.clean.num_rows} kept"))
         for done, name, count in cleaning_counts(result):
-            rows.append((done, f"{count} {name}"))
+            rows.append((done, str(count) if name == done else f"{count} {name}"))
     rows += [("note", note) for note in result.input.get("notes", ())]
     return Table("What came in", ("", ""), tuple(rows))
 
@@ -79,6 +79,13 @@ def cleaning_counts(result: RunResult) -> list[tuple[str, str, int]]:
     if result.clean is None:
         return []
     return [(entry.action, entry.name, entry.rows) for entry in result.clean.entries if entry.rows]
+
+
+def cleaning_table(result: RunResult) -> Table:
+    """Every reason for which a sample was dropped, clipped, folded or flagged, with its count."""
+    entries = () if result.clean is None else [entry for entry in result.clean.entries if entry.rows]
+    rows = [(entry.action, entry.name, str(entry.rows), entry.reason) for entry in entries]
+    return Table("Cleaning", ("", "flag", "samples", "reason"), tuple(rows))
 
 
 def done_table(result: RunResult) -> Table:

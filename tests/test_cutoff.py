@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.special
 
-from sbrdf_jax.cutoff import hemisphere_modes, lobe_half_width, measure_cutoff, sequential_bases
+from sbrdf_jax.cutoff import cutoff_warnings, hemisphere_modes, lobe_half_width, measure_cutoff, sequential_bases
 
 STEP = np.radians(7.5)  # cut-off at degree 24
 STEPS = {"theta_i_step": STEP, "theta_o_step": STEP, "phi_o_step": STEP}
@@ -66,7 +66,8 @@ def test_powers_add_up_and_white_noise_is_flat(rng):
     # each mode takes 1 / 600 of white noise, so what is above the cut-off is counted, not guessed
     left = 1 - spectrum.num_modes[spectrum.degree <= spectrum.cutoff].sum() / 600
     assert spectrum.share_above == pytest.approx(np.sqrt(left / energy), rel=0.02)
-    assert "or the noise is that large" in spectrum.warning
+    (warning,) = cutoff_warnings([spectrum])
+    assert "or the noise is as large, at theta_i 0 deg" in warning
 
 
 @pytest.mark.parametrize("half_width_deg", [4.0, 9.0, 16.0, 25.0])
@@ -78,7 +79,7 @@ def test_half_width_of_a_planted_lobe_and_its_warning(rng, half_width_deg):
     value = 0.1 + 2.0 * 0.5 ** ((alpha / np.radians(half_width_deg)) ** 2)
     assert np.degrees(lobe_half_width(theta_i, theta, phi, value)) == pytest.approx(half_width_deg, abs=spacing / 2)
     (spectrum,) = measure_cutoff(np.full(1000, theta_i), theta, phi, value[:, None], **STEPS)
-    assert ("half width" in spectrum.warning) == (half_width_deg < 1.5 * 7.5)
+    assert any("coarse for the lobe" in text for text in cutoff_warnings([spectrum])) == (half_width_deg < 1.5 * 7.5)
     assert spectrum.steps_per_half_width == pytest.approx(half_width_deg / 7.5, abs=spacing / 15)
 
 
@@ -91,8 +92,10 @@ def test_spike_is_above_the_cutoff_and_a_matte_surface_has_no_lobe(rng):
     quiet, loud = (
         measure_cutoff(np.full(400, 0.5), theta, phi, value[:, None], **STEPS)[0] for value in (matte, spiked)
     )
-    assert quiet.warning == "" and quiet.share_above < 1e-3
-    assert loud.share_above > 0.3 and "theta_i 28.65 deg" in loud.warning
+    assert cutoff_warnings([quiet]) == [] and quiet.share_above < 1e-3
+    assert loud.share_above > 0.3
+    narrow, aliased = cutoff_warnings([quiet, loud])
+    assert "coarse for the lobe at theta_i 28.6 deg" in narrow and "root mean square lies above the cut-off" in aliased
 
 
 def test_in_plane_samples_have_one_mode_a_degree(rng):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sbrdf_jax import builtin, formats
 from sbrdf_jax.errors import UserError
-from sbrdf_jax.formats import raw_hdf5, table, text
+from sbrdf_jax.formats import isolated, raw_hdf5, table, text
 from sbrdf_jax.options import InputOptions
 from sbrdf_jax.records import RawSamples
 
@@ -347,12 +347,12 @@ def test_missing_file_folder_and_device(tmp_path):
 
 WRONG_HDF5 = [
     ("other schema", {"attributes": {"schema_name": "other"}}, "schema_name: found 'other', expected 'sbrdf-raw'"),
-    ("no schema", {"attributes": {"schema_name": None}}, "found no attribute schema_name"),
+    ("no schema", {"attributes": {"schema_name": None}}, "schema_name: found none, expected 'sbrdf-raw'"),
     ("a result", {"attributes": {"schema_name": "sbrdf-result"}}, "found a result, expected a measurement"),
-    ("newer schema", {"attributes": {"schema_version": 2}}, "schema_version: found '2', expected at most 1"),
+    ("newer schema", {"attributes": {"schema_version": 2}}, "schema_version: found 2, expected 1 to 1"),
     ("schema version as text", {"attributes": {"schema_version": "one"}}, "schema_version: found 'one'"),
     ("unknown quantity", {"attributes": {"quantity": "btdf"}}, "quantity: found 'btdf', expected brdf or"),
-    ("bad azimuth", {"attributes": {"mirror_azimuth_deg": 90}}, "mirror_azimuth_deg: found '90', expected 180 or 0"),
+    ("bad azimuth", {"attributes": {"mirror_azimuth_deg": 90}}, "mirror_azimuth_deg: found 90, expected 180 or 0"),
     ("huge attribute", {"attributes": {"quantity": "x" * 20000}}, "quantity: found 'xxx"),
     (
         "array for a word",
@@ -363,8 +363,8 @@ WRONG_HDF5 = [
     ("text", {"theta_o_deg": ["a", "b", "c", "d"]}, "theta_o_deg: found type 'object', expected numbers"),
     ("complex", {"value": np.ones((4, 2)) * 1j}, "value: found type 'complex128', expected numbers"),
     ("transposed", {"value": np.ones((2, 4))}, "value: found shape (2, 4), expected (4, 2)"),
-    ("one column", {"value": np.ones(4)}, "value: found 1 axes, expected 2"),
-    ("scalar", {"wavelength_nm": 500.0}, "wavelength_nm: found 0 axes, expected 1"),
+    ("one column", {"value": np.ones(4)}, "value: found shape (4,), expected (4, 2)"),
+    ("scalar", {"wavelength_nm": 500.0}, "wavelength_nm: found shape (), expected (1,)"),
     ("shorter angles", {"phi_o_deg": [1.0, 2.0]}, "phi_o_deg: found shape (2,), expected (4,)"),
     (
         "too few",
@@ -416,6 +416,30 @@ def test_hostile_hdf5_is_refused_before_it_is_read(tmp_path):
     ):
         with pytest.raises(UserError, match=expected):
             formats.read(path, options())
+
+
+@pytest.mark.parametrize("ending", ["os.kill(os.getpid(), signal.SIGSEGV)", "signal.alarm(1); time.sleep(60)", "1 / 0"])
+def test_a_crash_or_hang_of_the_hdf5_library_is_one_line(tmp_path, monkeypatch, ending):
+    path = write_raw(tmp_path / "measured.h5")
+    assert formats.read(path, options()).num_samples == 4  # the child is up
+    script = tmp_path / "worker.py"
+    script.write_text(f"import os, signal, sys, time\nsys.stdin.readline()\n{ending}\n")
+    isolated._stop_own()
+    monkeypatch.setattr(isolated, "WORKER", script)
+    for _ in range(2):
+        with pytest.raises(UserError, match=r"found damaged HDF5 \(reading it crashes or does not end\)"):
+            formats.read(path, options())
+    monkeypatch.undo()
+    assert formats.read(path, options()).num_samples == 4  # a new child
+
+
+def test_hdf5_of_no_samples_and_killed_children(tmp_path):
+    empty = write_raw(tmp_path / "empty.h5", **{k: np.ones(0) for k in raw_hdf5.ANGLES}, value=np.ones((0, 2)))
+    with pytest.raises(UserError, match="found 0 samples"):
+        formats.read(empty, options())
+    isolated._running_worker().kill()
+    with pytest.raises(UserError, match="found 0 samples"):
+        formats.read(empty, options())
 
 
 def test_text_is_bounded(tmp_path, monkeypatch):

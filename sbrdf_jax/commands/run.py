@@ -7,6 +7,8 @@ import time
 import traceback
 from pathlib import Path
 
+from sbrdf_jax.cli import SOME_LANES_FAILED, UNEXPECTED
+
 SUMMARY = "From a measurement to a result, as a config says."
 EXAMPLE = """example:
   sbrdf run configs/quickstart.yaml output.path=results/mine.h5 represent.max_degree=1
@@ -27,7 +29,6 @@ def run(args: argparse.Namespace) -> int:
     from sbrdf_jax.config import check_output, load_config, resolve
     from sbrdf_jax.errors import UserError
     from sbrdf_jax.formats import read
-    from sbrdf_jax.progress import Progress
     from sbrdf_jax.runtime import set_up_jax
 
     start = time.perf_counter()
@@ -36,32 +37,49 @@ def run(args: argparse.Namespace) -> int:
         check_output(options)
     set_up_jax()
     raw = read(options.input.path, options.input)
-    if args.plan:
-        from sbrdf_jax.pipeline import prepare
-        from sbrdf_jax.plan import plan_text
 
-        print(plan_text(prepare(raw, options).rows))
-        return 0
     from sbrdf_jax.pipeline import prepare
+    from sbrdf_jax.plan import plan_text
 
-    prepare(raw, options)  # a measurement that is refused leaves no log and no folder behind
+    ready = prepare(raw, options)
+    if args.plan:
+        print(plan_text(ready.rows))
+        return 0
     output = Path(options.output.path)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    with Progress(output.with_name(output.name + ".log")) as progress:
+    with open_progress(output) as progress:
+        progress.say(f"{raw.source}: {ready.cleaned.report.num_kept} of {raw.num_samples} samples kept")
         try:
-            return _run(options, raw, progress, time.perf_counter() - start)
+            return _run(options, raw, ready, progress, time.perf_counter() - start)
         except (UserError, KeyboardInterrupt, SystemExit) as error:
-            progress.log(f"stopped: {type(error).__name__}: {error}")
+            progress.log(f"stopped: {type(error).__name__} {error}".rstrip())
             raise
         except Exception as error:
             for line in traceback.format_exc().splitlines():
                 progress.log(line)
             reason = (str(error).splitlines() or [""])[0]
             print(f"sbrdf run: unexpected {type(error).__name__}: {reason}; see {output}.log", file=sys.stderr)
-            return 1
+            return UNEXPECTED
 
 
-def _run(options, raw, progress, set_up_seconds: float) -> int:
+def open_progress(output: Path):
+    """Open the log `<output>.log`; its folder is made where it is missing.
+
+    Raises:
+        UserError: The log cannot be written, and so neither can the result.
+    """
+    from sbrdf_jax.errors import UserError
+    from sbrdf_jax.progress import Progress
+
+    log = output.with_name(output.name + ".log")
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        return Progress(log)
+    except OSError as error:
+        found = f"found a log that cannot be written ({error.strerror})"
+        raise UserError(f"{log}: {found}; expected a folder to write to") from None
+
+
+def _run(options, raw, ready, progress, set_up_seconds: float) -> int:
     from datetime import UTC, datetime
 
     from sbrdf_jax.config import resolved_yaml
@@ -71,14 +89,14 @@ def _run(options, raw, progress, set_up_seconds: float) -> int:
     from sbrdf_jax.summary import summary_text
 
     output = Path(options.output.path)
-    result = process(raw, options, progress)
-    timing = {"set_up": {"total": set_up_seconds, "compile": 0.0, "run": set_up_seconds}} | dict(result.timing)
+    result = process(raw, ready, options, progress)
+    set_up = {"set_up": {"total": set_up_seconds, "compile": 0.0, "run": set_up_seconds}}
     result = dataclasses.replace(
         result,
         config=resolved_yaml(options),
         created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         versions=versions(),
-        timing=timing,
+        timing=set_up | dict(result.timing),
     )
     with progress.stage("save"):
         save(output, result)
@@ -87,10 +105,10 @@ def _run(options, raw, progress, set_up_seconds: float) -> int:
         from sbrdf_jax.report import write_page
 
         with progress.stage("report"):
-            page = write_page([(output.stem, result)], output.with_suffix(""), raw=raw)
+            page = write_page([(output.stem, result)], output.with_name(f"{output.stem}_report"), raw)
             progress.update(str(page))
-    progress.say(summary_text(result))
+    progress.say("\n" + summary_text(result))
     failures = failed_lanes(result)
     for line in failures:
         progress.say(line)
-    return 3 if failures else 0
+    return SOME_LANES_FAILED if failures else 0

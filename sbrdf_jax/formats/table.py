@@ -114,6 +114,7 @@ def _angles(table: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return theta_i, theta_o, phi_o [rad] after checking that they can be what the format says."""
     in_degrees = table.angle_unit == "deg"
     angles = [np.asarray(a, float) for a in (table.theta_i, table.theta_o, table.phi_o)]
+    angles = [np.where(np.isfinite(a), a, np.nan) for a in angles]  # dropped by cleaning, with a count
     theta_i, theta_o, phi_o = (np.radians(a) for a in angles) if in_degrees else angles
     unit = "degrees" if in_degrees else "rad"
     quarter = 90 if in_degrees else np.pi / 2

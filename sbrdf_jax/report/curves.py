@@ -7,6 +7,7 @@ import numpy as np
 
 from sbrdf_jax.encoding import decode
 from sbrdf_jax.evaluation import evaluate_in_chunks
+from sbrdf_jax.metrics import CHUNK_SIZE
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, RawSamples, SpectralField
 from sbrdf_jax.report.fine_grid import FineGrid, RingEffect, has_no_data, pick_wavelength
 from sbrdf_jax.report.lobe_fits import KindFit
@@ -24,6 +25,7 @@ def plane_of_incidence(fine: FineGrid, gridded: GriddedBRDF, samples: RawSamples
     """Figure 7: the resampled BRDF in the plane of incidence at one wavelength, samples near the plane beside it."""
     figure = new_figure()
     axes = figure.subplots()
+    num_shown = 0
     for k, (incidence, color, line) in enumerate(zip(fine.incidences, SERIES, LINES, strict=False)):
         angle, value = fine.plane(fine.windowed, k)
         label = f"$\\theta_i$ = {incidence.text}" + (", no data" if has_no_data(gridded, incidence.index) else "")
@@ -33,8 +35,9 @@ def plane_of_incidence(fine: FineGrid, gridded: GriddedBRDF, samples: RawSamples
         if samples is not None:
             x, y = samples_in_plane(samples, incidence.value, fine.wavelength.value)
             axes.plot(x, y, color=color, marker="x", markersize=4, alpha=0.45, linewidth=0, zorder=2)
+            num_shown += len(x)
     axes.plot([], [], color=MUTED, marker="o", markersize=3.4, linewidth=0, label="nodes of the grid")
-    if samples is not None:
+    if num_shown:
         axes.plot([], [], color=MUTED, marker="x", markersize=4, linewidth=0, label="samples within 3° of the plane")
     plane_axis(axes)
     axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
@@ -66,7 +69,7 @@ def samples_in_plane(samples: RawSamples, theta_i: float, wavelength_nm: float) 
 
 def ring_curves(fine: FineGrid, gridded: GriddedBRDF, effect: RingEffect) -> Any:
     """The ring effect at the first incidence: eq. (5) with and without the window, and what lies between the nodes."""
-    figure = new_figure(height=3.9)
+    figure = new_figure(height=4.3)
     axes = figure.subplots()
     angle, plain = fine.plane(fine.plain, 0)
     _, windowed = fine.plane(fine.windowed, 0)
@@ -97,10 +100,9 @@ def lobe_kinds(fine: FineGrid, fits: Sequence[KindFit]) -> Any:
         axes.plot(np.degrees(angle), original, color=INK, linewidth=2.4, label="orig")
         shown = [fit for fit in fits if fit.max_degree == degree]
         for fit, color, line in zip(shown, SERIES, LINES[1:], strict=False):
-            wavelength = np.array([fine.wavelength.value])
-            value = evaluate_in_chunks(fit.compact, theta_i, np.abs(angle), phi_o, wavelength)[:, 0]
+            value = evaluate_in_chunks(fit.compact, theta_i, np.abs(angle), phi_o, chunk_size=CHUNK_SIZE)
             label = f"{KIND_TEXT.get(fit.kind, fit.kind)}: η = {100 * fit.error:.1f} %"
-            axes.plot(np.degrees(angle), value, color=color, linestyle=line, label=label)
+            axes.plot(np.degrees(angle), value[:, fine.wavelength.index], color=color, linestyle=line, label=label)
         plane_axis(axes)
         axes.set_xlabel("θ in the plane of incidence [deg]")
         axes.set_title(f"L = {degree}", loc="center")
@@ -126,19 +128,20 @@ def spectra(gridded: GriddedBRDF, field: SpectralField, compact: CompactBRDF | N
     panels = np.atleast_1d(figure.subplots(1, len(places)))
     wavelength = np.asarray(gridded.wavelength_nm)
     marker = "o" if len(wavelength) < 60 else None
-    for axes, (i, j, k) in zip(panels, places, strict=True):
-        direction = [float(gridded.theta_i[i]), float(gridded.theta_o[j]), float(gridded.phi_o[k])]
-        original = np.asarray(gridded.brdf)[i, j, k]
+    at = np.array(places)
+    angles = [np.asarray(a, float)[at[:, k]] for k, a in enumerate((gridded.theta_i, gridded.theta_o, gridded.phi_o))]
+    rebuilt = None if compact is None else evaluate_in_chunks(compact, *angles, chunk_size=CHUNK_SIZE)
+    series = np.asarray(decode(np.asarray(field.coefficient)[tuple(at.T)], field.basis))
+    for number, axes in enumerate(panels):
+        original = np.asarray(gridded.brdf)[tuple(at[number])]
         axes.plot(wavelength, original, color=INK, linewidth=2.4, marker=marker, markersize=3.5, label="orig (grid)")
-        series = np.asarray(decode(field.coefficient[i, j, k], field.basis))
-        label = f"{field.basis.kind}, {field.coefficient.shape[-1]} coefficients"
-        axes.plot(wavelength, series, color=SERIES[0], linestyle=LINES[1], label=label)
-        if compact is not None:
-            value = evaluate_in_chunks(compact, *(np.array([angle]) for angle in direction))[0]
-            axes.plot(wavelength, value, color=SERIES[1], linestyle=LINES[2], label="compact form")
-        degrees = np.degrees(direction)
-        azimuth = "" if j == 0 else f", {degrees[2]:.4g}°"
-        axes.set_title(f"$\\theta_i$ = {degrees[0]:.4g}°,  out ({degrees[1]:.4g}°{azimuth})", fontsize=10.5)
+        label = f"{field.basis.kind}, {np.shape(field.basis.synthesis)[0]} coefficients"
+        axes.plot(wavelength, series[number], color=SERIES[0], linestyle=LINES[1], label=label)
+        if rebuilt is not None:
+            axes.plot(wavelength, rebuilt[number], color=SERIES[1], linestyle=LINES[2], label="compact form")
+        theta_i, theta_o, phi_o = (np.degrees(angle[number]) for angle in angles)
+        azimuth = "" if theta_o == 0 else f", {phi_o:.4g}°"
+        axes.set_title(f"$\\theta_i$ = {theta_i:.4g}°,  out ({theta_o:.4g}°{azimuth})", fontsize=10.5)
         axes.set_xlabel("wavelength [nm]")
         low, high = axes.get_ylim()
         axes.set_ylim(min(0.0, low), high)

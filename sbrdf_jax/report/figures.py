@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sbrdf_jax.config import parse_config
-from sbrdf_jax.cutoff import CutoffSpectrum, measure_cutoff
+from sbrdf_jax.cutoff import CutoffSpectrum, cutoff_warnings, measure_cutoff
 from sbrdf_jax.evaluation import evaluate_in_chunks
 from sbrdf_jax.records import GriddedBRDF, RawSamples
 from sbrdf_jax.report import curves, hemisphere, quality
@@ -68,11 +68,10 @@ def _sketches(result: RunResult, samples: RawSamples | None) -> Iterator[_Sketch
         yield from _of_interpolation(result, samples)
     if result.field is not None:
         yield _spectra(result)
-    yield from _of_quality(result)
-    if samples is not None:
-        spectra = measure_samples(samples, result.gridded)
-        if spectra:
-            yield _cutoff(spectra)
+    if "relative_error" in result.metrics:
+        yield _errors(result)
+    yield from _of_samples(result, samples)
+    yield from _of_physics_and_solver(result)
 
 
 def _of_interpolation(result: RunResult, samples: RawSamples | None) -> Iterator[_Sketch]:
@@ -84,7 +83,7 @@ def _of_interpolation(result: RunResult, samples: RawSamples | None) -> Iterator
         curves.plane_of_incidence(fine, grid, samples),
         "In the plane of incidence",
         f"The resampled BRDF at {fine.wavelength.text} (the paper's figure 7): interpolation, nodes of the grid and, "
-        "where they are known, the samples beside the plane.",
+        "where there are any at these incident angles, the samples beside the plane.",
     )
     numbers = (
         f"Total variation over the hemisphere at {fine.incidences[0].text} incidence: {effect.plain:.4g} rad/sr "
@@ -96,7 +95,7 @@ def _of_interpolation(result: RunResult, samples: RawSamples | None) -> Iterator
         hemisphere.color_maps(fine, grid, effect),
         "In colour",
         "The interpolated field without and with the window of eq. 17 (the paper's figures 8 and 9). Each incident "
-        f"angle has one exposure for both. {numbers}",
+        f"angle has one exposure for both; at 1 × a perfect diffuser is white. {numbers}",
     )
     yield _Sketch(
         "ring_effect",
@@ -132,37 +131,35 @@ def _spectra(result: RunResult) -> _Sketch:
     )
 
 
-def _of_quality(result: RunResult) -> Iterator[_Sketch]:
-    grid, metrics = result.gridded, result.metrics
-    if "relative_error" in metrics:
-        yield _Sketch(
-            "errors",
-            quality.errors(grid, metrics),
-            "Errors of the compact form",
-            "Eq. 18 at every incident angle, at the nodes and at the midpoints between them, and what it is made of. "
-            "Squares of the parts add up to that of the whole, but for cross terms.",
-        )
+def _errors(result: RunResult) -> _Sketch:
+    return _Sketch(
+        "errors",
+        quality.errors(result.gridded, result.metrics),
+        "Errors of the compact form",
+        "Eq. 18 at every incident angle, at the nodes and at the midpoints between them, and what it is made of. "
+        "Squares of the parts add up to that of the whole, but for cross terms.",
+    )
+
+
+def _of_samples(result: RunResult, samples: RawSamples | None) -> Iterator[_Sketch]:
     yield _Sketch(
         "coverage",
-        hemisphere.coverage_maps(grid),
+        hemisphere.coverage_maps(result.gridded),
         "Coverage",
         "Nodes with a sample within one step, nodes between samples, and nodes beyond the measured range, where the "
         "values are extrapolated by the smoothness rows alone.",
     )
-    if "albedo" in metrics:
-        absolute = result.input.get("quantity", "brdf") == "brdf"
+    spectra = [] if samples is None else measure_samples(samples, result.gridded)
+    if spectra:
         yield _Sketch(
-            "albedo",
-            quality.albedo(grid, np.asarray(metrics["albedo"]), absolute=absolute),
-            "Albedo",
-            "The share of light that the grid reflects, for each incident angle. Above 1 it would create energy.",
+            "cutoff",
+            quality.cutoff(spectra),
+            "Samples against the cut-off",
+            "The power of samples and residual over angular frequency (the paper's figures 2 to 5), found degree by "
+            "degree in harmonics that are made orthogonal on the samples, so that scattered sampling leaks nothing. "
+            "What lies beyond the cut-off is filtered if it is noise and aliased if it is signal.",
+            tuple(cutoff_warnings(spectra)),
         )
-    yield _Sketch(
-        "solver",
-        quality.solver(grid, tolerance_of(result)),
-        "The solver's certificate",
-        "Relative KKT residual of every wavelength's non-negative least squares, of the stored solution.",
-    )
     counts = cleaning_counts(result)
     if counts and result.clean is not None:
         yield _Sketch(
@@ -173,15 +170,20 @@ def _of_quality(result: RunResult) -> Iterator[_Sketch]:
         )
 
 
-def _cutoff(spectra: list[CutoffSpectrum]) -> _Sketch:
-    return _Sketch(
-        "cutoff",
-        quality.cutoff(spectra),
-        "Samples against the cut-off",
-        "The power of samples and residual over angular frequency (the paper's figures 2 to 5), found degree by degree "
-        "in harmonics that are made orthogonal on the samples, so that scattered sampling leaks nothing. What lies "
-        "beyond the cut-off is filtered if it is noise and aliased if it is signal.",
-        tuple(spectrum.warning for spectrum in spectra if spectrum.warning),
+def _of_physics_and_solver(result: RunResult) -> Iterator[_Sketch]:
+    if "albedo" in result.metrics:
+        absolute = result.input.get("quantity", "brdf") == "brdf"
+        yield _Sketch(
+            "albedo",
+            quality.albedo(result.gridded, np.asarray(result.metrics["albedo"]), absolute=absolute),
+            "Albedo",
+            "The share of light that the grid reflects, for each incident angle. Above 1 it would create energy.",
+        )
+    yield _Sketch(
+        "solver",
+        quality.solver(result.gridded, tolerance_of(result)),
+        "The solver's certificate",
+        "Relative KKT residual of every wavelength's non-negative least squares, of the stored solution.",
     )
 
 

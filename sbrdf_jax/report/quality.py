@@ -133,7 +133,7 @@ def cleaning(counts: Sequence[tuple[str, str, int]], num_read: int) -> Any:
     Returns:
         The figure.
     """
-    figure = new_figure(width=8.4, height=1.3 + 0.34 * max(len(counts), 1))
+    figure = new_figure(width=8.4, height=1.3 + 0.34 * max(len(counts), 2))
     axes = figure.subplots()
     colors = {"dropped": VERMILLION, "clipped": ORANGE, "flagged": BLUE, "folded": SKY}
     for row, (done, _, number) in enumerate(reversed(counts)):
@@ -142,6 +142,7 @@ def cleaning(counts: Sequence[tuple[str, str, int]], num_read: int) -> Any:
     axes.set_yticks(range(len(counts)), [f"{done}: {reason}" for done, reason, _ in reversed(counts)])
     axes.set_xlabel(f"samples, of {num_read:,} read")
     axes.margins(x=0.18)
+    axes.set_ylim(-0.7, max(len(counts), 2) - 0.3)
     axes.grid(axis="y", visible=False)
     axes.set_title("Cleaning")
     return figure
@@ -172,10 +173,10 @@ def cutoff(spectra: Sequence[CutoffSpectrum]) -> Any:
     above = 100 * np.array([max(s.share_above, 1e-6) for s in spectra])
     right.plot(angles, above, color=BLUE, marker="o", markersize=4.5, label="RMS above the cut-off [%]")
     right.axhline(100 * ALIAS_SHARE, color=ORANGE, linewidth=1.3, label=f"{100 * ALIAS_SHARE:g} %: signal is aliased")
-    aliased = [k for k, s in enumerate(spectra) if s.warning]
+    aliased = [k for k, s in enumerate(spectra) if s.is_narrow or s.is_aliased]
     if aliased:
         right.plot(angles[aliased], above[aliased], color=VERMILLION, marker="X", markersize=8, linewidth=0,
-                   label="warned of")  # fmt: skip
+                   label="warned of: narrow lobe or aliased")  # fmt: skip
     right.set_yscale("log")
     right.yaxis.set_major_formatter(_percent)
     right.set_xlabel("incident angle $\\theta_i$ [deg]")

@@ -15,7 +15,7 @@ BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", 
 INK, MUTED, FAINT, PAPER = "#1f2328", "#6b7280", "#d7dbe0", "#ffffff"
 SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 LINES = ("-", (0, (5, 1.6)), (0, (1.4, 1.2)), (0, (6, 1.5, 1.2, 1.5)), "-", (0, (5, 1.6)))
-DPI = 120
+DPI = 144
 
 _RC = {
     "font.size": 10.5,
@@ -59,11 +59,14 @@ def new_figure(width: float = 7.6, height: float = 4.2) -> Any:
 
     figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
+    figure.get_layout_engine().set(w_pad=0.09, h_pad=0.09)
     return figure
 
 
 def save_figure(figure: Any, path: Path) -> Path:
     """Write a figure as PNG and return its path; the same figure gives the same bytes."""
+    figure.get_layout_engine().execute(figure)
+    figure.set_layout_engine("none")  # savefig would lay out and draw everything twice
     with whole_file(path) as temporary:
         figure.savefig(temporary, format="png", metadata={"Software": None})
     return path

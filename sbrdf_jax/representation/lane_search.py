@@ -1,0 +1,261 @@
+"""The search of section 4.2 over critical angles and kinds of lobe, all lanes in equal-shaped batches.
+
+A pair is one coefficient of one incident angle; a lane is a pair with one critical angle and
+one kind of lobe. Batches have fixed shapes, so another material of the same geometry compiles
+nothing, however many pairs it has.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sbrdf_jax.angles import MIRROR_AZIMUTH, angle_between
+from sbrdf_jax.lobes import LOBE_KINDS, lobe_exponents
+from sbrdf_jax.records import Status
+from sbrdf_jax.representation.background import fit_background
+from sbrdf_jax.representation.directions import DirectionSet
+from sbrdf_jax.representation.lobe_fit import Lobe, best_start, fit_lobe, width_bank
+from sbrdf_jax.representation.peak import PlaneOfIncidence, lobe_peaks
+
+CANDIDATES = 21
+FALLEN = 0.05  # of the far median: a coefficient this close to it has no lobe left
+HALVINGS = 36  # after which a lobe is 1e-11 of its height
+ROUNDING = 1e-9  # rad
+PAIR_BATCH = 16
+LANE_BATCH = 64  # arrays of so many lanes stay in the processor's cache
+POLISH_ROUNDS = 10
+
+
+class LobeKinds(NamedTuple):
+    """The kinds of lobe that are tried."""
+
+    index: tuple[int, ...]  # places in LOBE_KINDS
+    widths: Float[np.ndarray, "kind width"]  # bank of each, from the least width to the greatest
+
+
+class Pairs(NamedTuple):
+    """What a search starts from; NumPy on the host."""
+
+    value: Float[np.ndarray, "pair direction"]  # about 1 at its largest
+    alpha: Float[np.ndarray, "pair direction"]  # rad, from the lobe's peak
+    exponent: Float[np.ndarray, "pair kind direction"]  # s(alpha) of each kind
+
+
+class Winners(NamedTuple):
+    """The best lane of each pair."""
+
+    critical_angle: Float[np.ndarray, " pair"]  # rad
+    background: Float[np.ndarray, "pair function"]
+    kind: Int[np.ndarray, " pair"]  # place in LOBE_KINDS
+    lobe: Lobe  # arrays [pair]
+
+
+class Lanes(NamedTuple):
+    """What a search found, for every candidate and kind."""
+
+    critical_angle: Float[np.ndarray, "pair candidate"]  # rad
+    background: Float[np.ndarray, "pair candidate function"]  # of the orthonormal harmonics
+    target: Float[np.ndarray, "pair candidate direction"]  # what the background leaves
+    inside: Float[np.ndarray, "pair candidate direction"]  # directions within the critical angle
+    lobe: Lobe  # arrays [pair, candidate, kind]
+
+
+def lobe_kinds(index: tuple[int, ...], grid_step: float) -> LobeKinds:
+    """Return the kinds to try on a grid of a step [rad] that bounds their widths from below."""
+    of_step = np.asarray(lobe_exponents(np.array([grid_step])))[:, 0]
+    return LobeKinds(index, np.stack([width_bank(of_step[k]) for k in index]))
+
+
+def lobe_geometry(
+    peak_theta: Float[np.ndarray, " peak"], directions: DirectionSet
+) -> tuple[Float[np.ndarray, "peak direction"], Float[np.ndarray, "peak kind direction"]]:
+    """Return the angle of every direction from each peak [rad] at the mirror azimuth, and s of all `LOBE_KINDS`."""
+    axes = (directions.theta_o, directions.phi_o)
+    return _in_batches(lambda peak: _geometry(peak, *axes), LANE_BATCH, peak_theta)
+
+
+def critical_candidates(pairs: Pairs, num_functions: int) -> Float[np.ndarray, "pair candidate"]:
+    """Return uniform candidates for the critical angle [rad] of each pair.
+
+    From the half-width of the lobe (three directions inside, at least) to the angle where the
+    coefficient has fallen to its far median, within 5 % of that: the median of the farther half
+    of the directions. Where a lobe of that half-width reaches further, by any kind that is
+    tried, the range ends where it has vanished: only then is the background outside free of
+    it. As many directions as the background has functions stay outside.
+    """
+    order = np.argsort(pairs.alpha, axis=1)
+    value, alpha = (np.take_along_axis(array, order, 1) for array in (pairs.value, pairs.alpha))
+    exponent = np.take_along_axis(pairs.exponent, order[:, None], 2)
+    far = np.median(value[:, value.shape[1] // 2 :], axis=1, keepdims=True)
+    above = np.abs(value - far)
+    half = _first(above <= above[:, :3].max(axis=1, keepdims=True) / 2)
+    fallen = _first(above <= FALLEN * np.abs(far))
+    vanished = _first(np.all(exponent >= HALVINGS * np.take_along_axis(exponent, half[:, None], 2), axis=1))
+    most = np.minimum(alpha[:, [-num_functions - 1]], np.pi / 2)
+    lower = np.minimum(np.take_along_axis(alpha, np.maximum(half, 2), 1) + ROUNDING, most)
+    upper = np.clip(np.take_along_axis(alpha, np.maximum(fallen, vanished), 1), lower, most)
+    return np.linspace(lower[:, 0], upper[:, 0], CANDIDATES, axis=1)
+
+
+def search_lanes(
+    pairs: Pairs, kinds: LobeKinds, functions: Float[np.ndarray, "direction function"], weight: np.ndarray
+) -> Lanes:
+    """Fit background and lobe for every candidate and kind of every pair.
+
+    Args:
+        pairs: Coefficients, finite, scaled so that each is about 1 at its largest.
+        kinds: Which lobes.
+        functions: The orthonormal harmonics at the directions.
+        weight: How often each direction counts.
+    """
+    critical_angle = critical_candidates(pairs, functions.shape[1])
+    background, height, width = _in_batches(
+        lambda *pair: _prepare(*pair, kinds.widths, functions, weight), PAIR_BATCH, *pairs, critical_angle
+    )
+    target = pairs.value[:, None] - background @ functions.T
+    inside = pairs.alpha[:, None] <= critical_angle[..., None]
+    lobe = fit_lanes(target, inside, pairs.exponent[:, None], (height, width), kinds, weight)
+    return Lanes(critical_angle, background, target, inside, lobe)
+
+
+def fit_lanes(
+    target: Float[np.ndarray, "pair candidate direction"],
+    inside: Bool[np.ndarray, "pair candidate direction"],
+    exponent: Float[np.ndarray, "pair #candidate kind direction"],
+    start: tuple[np.ndarray, np.ndarray],
+    kinds: LobeKinds,
+    weight: Float[np.ndarray, " direction"],
+    only: np.ndarray | None = None,
+) -> Lobe:
+    """Fit lobes by Levenberg-Marquardt, all in batches of one shape.
+
+    Args:
+        target: What the background leaves.
+        inside: Directions within the critical angle.
+        exponent: s(alpha) of each kind.
+        start: Heights and widths to start from, [pair, candidate, kind].
+        kinds: Which lobes.
+        weight: How often each direction counts.
+        only: Fit these places of the flattened [pair, candidate, kind] alone.
+
+    Returns:
+        Arrays [pair, candidate, kind], or as `only`.
+    """
+    shape = start[0].shape
+    exponent = np.broadcast_to(exponent, (*shape, target.shape[-1]))
+    place = np.arange(start[0].size) if only is None else only
+
+    def fit(place):
+        pair, candidate, kind = np.unravel_index(place, shape)
+        lane = target[pair, candidate], inside[pair, candidate], exponent[pair, candidate, kind]
+        height, width = (array.ravel()[place] for array in start)
+        return _fit_batch(*lane, weight, (height, width), kinds.widths[kind][:, [0, -1]])
+
+    found = _in_batches(fit, LANE_BATCH, place)
+    return Lobe(*(array.reshape(shape) if only is None else array for array in found))
+
+
+def best_lanes(lanes: Lanes, pairs: Pairs, kinds: LobeKinds, weight: Float[np.ndarray, " direction"]) -> Winners:
+    """Return the lane of each pair with the least error over all directions.
+
+    The winners are fitted on until each is stationary: the search stops its lanes early, because
+    one slow lane makes all others of its batch wait.
+    """
+    shape = lanes.lobe.error.shape
+    pair = np.arange(shape[0])
+    best = lanes.lobe.error.reshape(shape[0], -1).argmin(axis=1) + pair * (shape[1] * shape[2])
+    flat = Lobe(*(array.ravel() for array in lanes.lobe))
+    for _ in range(POLISH_ROUNDS):
+        slow = best[flat.status[best] == Status.MAX_STEPS]
+        if not slow.size:
+            break
+        start = flat.height.reshape(shape), flat.width.reshape(shape)
+        again = fit_lanes(lanes.target, lanes.inside, pairs.exponent[:, None], start, kinds, weight, only=slow)
+        for whole, part in zip(flat, again, strict=True):
+            whole[slow] = part
+    _, candidate, kind = np.unravel_index(best, shape)
+    return Winners(
+        lanes.critical_angle[pair, candidate],
+        lanes.background[pair, candidate],
+        np.array(kinds.index)[kind],
+        Lobe(*(array[best] for array in flat)),
+    )
+
+
+def refine_peaks(
+    mean: Float[np.ndarray, "theta_i direction"],
+    theta_i: Float[np.ndarray, " theta_i"],
+    plane: PlaneOfIncidence,
+    directions: DirectionSet,
+    kinds: LobeKinds,
+    functions: Float[np.ndarray, "direction function"],
+) -> Float[np.ndarray, " theta_i"]:
+    """Return where the lobe of each incident angle points: theta_o of its peak [rad], at the mirror azimuth.
+
+    First by the mean of the spectra, a parabola through its logarithms. Then every candidate
+    background of a search on that mean is taken off, and the peak sought again on the rest: a
+    sloping background displaces the maximum of the sum. The least error wins.
+    """
+    largest = np.abs(mean).max(axis=1, keepdims=True)
+    mean = mean / np.where(largest > 0, largest, 1.0)
+    first = lobe_peaks(plane, mean, theta_i)
+    alpha, exponent = lobe_geometry(first, directions)
+    lanes = search_lanes(Pairs(mean, alpha, exponent[:, kinds.index]), kinds, functions, directions.weight)
+
+    shape = lanes.lobe.height.shape
+    rest, angle = lanes.target.reshape(-1, mean.shape[1]), np.repeat(theta_i, CANDIDATES)
+    moved = np.stack([lobe_peaks(plane, rest, angle, LOBE_KINDS[k]) for k in kinds.index], axis=-1)
+    _, exponent = lobe_geometry(moved.ravel(), directions)
+    exponent = exponent[np.arange(moved.size), np.tile(kinds.index, len(rest))].reshape(*shape, -1)
+    again = fit_lanes(lanes.target, lanes.inside, exponent, lanes.lobe[:2], kinds, directions.weight)
+
+    peaks = np.stack([np.broadcast_to(first[:, None, None], shape), moved.reshape(shape)], axis=1)
+    errors = np.stack([lanes.lobe.error, again.error], axis=1).reshape(len(first), -1)
+    return peaks.reshape(errors.shape)[np.arange(len(first)), errors.argmin(axis=1)]
+
+
+@jax.jit
+def _geometry(peak_theta, theta_o, phi_o):
+    def one(peak):
+        same = jnp.ones_like(theta_o)
+        return angle_between(theta_o, phi_o, peak * same, MIRROR_AZIMUTH * same)
+
+    alpha = jax.vmap(one)(peak_theta)
+    return alpha, jnp.moveaxis(lobe_exponents(alpha), 0, 1)
+
+
+@jax.jit
+def _prepare(value, alpha, exponent, critical_angle, widths, functions, weight):
+    """Return background [pair, candidate, function], start height and start width [pair, candidate, kind]."""
+
+    def candidate(value, alpha, exponent, critical_angle):
+        outside = alpha > critical_angle
+        background = fit_background(value, outside, functions, weight)
+        inside_weight = jnp.where(outside, 0.0, weight)
+        start = jax.vmap(best_start, (None, None, 0, 0))(value - functions @ background, inside_weight, exponent, widths)
+        return background, *start
+
+    of_pair = jax.vmap(candidate, (None, None, None, 0))
+    return jax.vmap(of_pair)(value, alpha, exponent, critical_angle)
+
+
+_fit_batch = jax.jit(jax.vmap(fit_lobe, in_axes=(0, 0, 0, None, 0, 0)))
+
+
+def _first(condition):
+    """Return, for each pair, the place of the first direction that meets a condition; the last one if none does."""
+    first = np.where(condition.any(axis=1), condition.argmax(axis=1), condition.shape[1] - 1)
+    return first[:, None]
+
+
+def _in_batches(function, size, *arrays):
+    """Call a function on batches of the leading axis, the last one filled with copies; NumPy arrays, joined."""
+    count = len(arrays[0])
+    answers = []
+    for start in range(0, count, size):
+        rows = np.minimum(np.arange(start, start + size), count - 1)
+        answers.append(function(*(array[rows] for array in arrays)))
+    return tuple(np.concatenate(parts)[:count] for parts in zip(*answers, strict=True))

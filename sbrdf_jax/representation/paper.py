@@ -1,0 +1,139 @@
+"""The paper's compact form, eq. (13) and section 4.2: harmonics plus one lobe for each coefficient.
+
+For every incident angle and coefficient: the background alone where that is enough, otherwise
+21 candidates for the critical angle, background by least squares outside, lobe on the rest
+inside, both added everywhere; the least error wins.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sbrdf_jax.angles import MIRROR_AZIMUTH, angle_between
+from sbrdf_jax.encoding import mean_spectrum
+from sbrdf_jax.harmonics import real_harmonics
+from sbrdf_jax.lobes import LOBE_KINDS, lobe_value_any
+from sbrdf_jax.options import RepresentOptions
+from sbrdf_jax.records import CompactBRDF, SpectralField, Status
+from sbrdf_jax.representation.background import orthonormal_harmonics
+from sbrdf_jax.representation.directions import distinct_directions, is_bilateral
+from sbrdf_jax.representation.peak import plane_of_incidence
+
+DEFAULT_MAX_DEGREE = 4
+ENOUGH = 0.01  # of a lane's energy: an error, or a gain, below it needs no lobe
+LANE_REASONS = ("searched", "background_suffices", "zero_everywhere", "nonfinite")
+
+
+def compact_coefficient(
+    compact: CompactBRDF,
+    i_theta: Int[Array, "*shape"] | int,
+    theta_o: Float[Array, "*shape"],
+    phi_o: Float[Array, "*shape"],
+) -> Float[Array, "*shape coefficient"]:
+    """Evaluate eq. (13) at directions, at nodes of the incident angle; pure, for jit, vmap and grad.
+
+    Args:
+        compact: Background and lobes.
+        i_theta: Node of theta_i, one for all directions or one each.
+        theta_o: Polar angle of exitance [rad].
+        phi_o: Azimuth of exitance [rad].
+
+    Returns:
+        Coefficients [1/sr] of the spectral basis.
+    """
+    harmonic = real_harmonics(theta_o, phi_o, compact.max_degree)
+    background = jnp.asarray(compact.background)[i_theta]
+    smooth = jnp.einsum("...h,...ch->...c", harmonic, background)
+    peak = jnp.broadcast_to(jnp.asarray(compact.lobe_peak_theta_o)[i_theta], theta_o.shape)
+    alpha = angle_between(theta_o, phi_o, peak, jnp.full_like(peak, MIRROR_AZIMUTH))
+    lobe = (jnp.asarray(a)[i_theta] for a in (compact.lobe_height, compact.lobe_width, compact.lobe_kind))
+    return smooth + lobe_value_any(alpha, *lobe)
+
+
+def represent(field: SpectralField, options: RepresentOptions) -> CompactBRDF:
+    """Return the paper's compact form of a field; `represent_with_plan` without its plan."""
+    return represent_with_plan(field, options)[0]
+
+
+def represent_with_plan(field: SpectralField, options: RepresentOptions) -> tuple[CompactBRDF, dict[str, Any]]:
+    """Return the paper's compact form of a field, and what was computed and what was skipped.
+
+    Args:
+        field: Coefficients at the nodes; phi_o from 0 to 2 pi inclusive.
+        options: `max_degree` (auto: 4) and `lobe` are used.
+
+    Returns:
+        The compact form, and a plan: `lane_reason` [theta_i, coefficient], places in
+        `reason_names`, and `num_lobe_fits`, candidates and kinds included.
+
+    Numerics:
+        Eq. (18) counts every node, so a direction weighs as many nodes as it has. A lane is
+        "no lobe" where its background leaves less than 1 % of its energy, or the lobe takes
+        off less. A lane with a value that is not finite has a background of NaN and the status
+        NONFINITE; the others do not notice.
+    """
+    # here, because its solver takes a second to import: not for those who only evaluate
+    from sbrdf_jax.representation import lane_search
+
+    theta_i, theta_o, phi_o = (np.asarray(axis, np.float64) for axis in (field.theta_i, field.theta_o, field.phi_o))
+    max_degree = DEFAULT_MAX_DEGREE if options.max_degree == "auto" else options.max_degree
+    chosen = LOBE_KINDS[1:] if options.lobe == "best" else (options.lobe,)
+    kinds = lane_search.lobe_kinds(tuple(LOBE_KINDS.index(kind) for kind in chosen), np.diff(theta_o).min())
+
+    node_value = np.asarray(field.coefficient, np.float64)
+    directions = distinct_directions(theta_o, phi_o, folded=is_bilateral(node_value, phi_o))
+    harmonics = orthonormal_harmonics(directions, max_degree)
+    functions, weight = harmonics.value, directions.weight
+
+    value = np.moveaxis(directions.merge(node_value), 1, 2)  # [theta_i, coefficient, direction]
+    is_finite = np.isfinite(value).all(axis=2)
+    value = np.where(is_finite[..., None], value, 0.0)
+    scale = np.abs(value).max(axis=2)
+    scale = np.where(scale > 0, scale, 1.0)
+    value = value / scale[..., None]
+
+    background = (value * weight) @ functions
+    energy, error = value**2 @ weight, (value - background @ functions.T) ** 2 @ weight
+    reason = np.where(error < ENOUGH**2 * energy, 1, 0)
+    reason = np.where(energy > 0, reason, 2)
+    reason = np.where(is_finite, reason, 3)
+
+    mean = mean_spectrum(np.moveaxis(value * scale[..., None], 1, 2), field.basis)
+    plane = plane_of_incidence(theta_o, phi_o, directions)
+    peak = lane_search.refine_peaks(mean, theta_i, plane, directions, kinds, functions)
+
+    kind = np.zeros(reason.shape, int)
+    height, width = np.zeros(reason.shape), np.ones(reason.shape)
+    critical_angle = np.full(reason.shape, np.nan)
+    status = np.where(is_finite, int(Status.NO_LOBE), int(Status.NONFINITE))
+    i, k = np.nonzero(reason == 0)
+    if i.size:
+        alpha, exponent = lane_search.lobe_geometry(peak, directions)
+        pairs = lane_search.Pairs(value[i, k], alpha[i], exponent[i][:, kinds.index])
+        lanes = lane_search.search_lanes(pairs, kinds, functions, weight)
+        best = lane_search.best_lanes(lanes, pairs, kinds, weight)
+        gains = np.sqrt(error[i, k]) - np.sqrt(best.lobe.error) >= ENOUGH * np.sqrt(energy[i, k])
+        i, k = i[gains], k[gains]
+        background[i, k] = best.background[gains]
+        kind[i, k], critical_angle[i, k] = best.kind[gains], best.critical_angle[gains]
+        height[i, k], width[i, k] = best.lobe.height[gains] * scale[i, k], best.lobe.width[gains]
+        status[i, k] = best.lobe.status[gains]
+    background = (background * scale[..., None]) @ harmonics.to_harmonics.T
+    background[~is_finite] = np.nan
+    compact = CompactBRDF(
+        theta_i,
+        field.basis,
+        background,
+        kind,
+        height,
+        width,
+        critical_angle,
+        peak,
+        status,
+        max_degree=max_degree,
+        interpolate_theta_i=field.interpolate_theta_i,
+    )
+    num_fits = int((reason == 0).sum()) * lane_search.CANDIDATES * len(kinds.index)
+    return compact, {"lane_reason": reason, "reason_names": LANE_REASONS, "num_lobe_fits": num_fits}
