@@ -46,10 +46,7 @@ def find_dropouts(samples: RawSamples, incidence: Int[np.ndarray, " sample"]) ->
         noise = spectral_noise(value)
         if noise > 0:
             level = np.log(np.maximum(value, 0) + noise).mean(axis=1)
-            start, index = _neighbours(samples.theta_o[member], samples.phi_o[member])
-            if _may_be_deep(level, start, index):
-                bounds = zip(start[:-1], start[1:], strict=True)
-                mask[member] = _low(level, [index[a:b].tolist() for a, b in bounds])
+            mask[member] = _low(level, *_neighbours(samples.theta_o[member], samples.phi_o[member]))
     return mask
 
 
@@ -76,61 +73,49 @@ def spectral_noise(value: Float[np.ndarray, "sample wavelength"]) -> float:
     return max(1.4826 * float(np.median(second_difference)) / np.sqrt(6), 1e-5 * stand_in)
 
 
-def _may_be_deep(level: np.ndarray, start: np.ndarray, index: np.ndarray) -> bool:
-    """Whether some local minimum may be the floor of a deep basin; spares the search where data are smooth."""
-    some = np.diff(start) > 0
-    below = level[some]
-    lowest, highest = (f.reduceat(level[index], start[:-1][some]) for f in (np.minimum, np.maximum))
-    # with as many neighbours as a basin has samples, one of them lies on its rim
-    enclosed = np.diff(start)[some] < MAX_TOGETHER
-    return bool(np.any((below <= lowest) & (enclosed | (highest - below > np.log(MIN_FACTOR)))))
-
-
-def _low(level: np.ndarray, neighbours: list[list[int]]) -> np.ndarray:
+def _low(level: np.ndarray, start: np.ndarray, index: np.ndarray) -> np.ndarray:
     """Mask of the samples that lie deep in a basin, and of those half in its shadow."""
-    low = np.zeros(len(level), bool)
-    for members, rim_level in _basins(level, neighbours):
-        deep = [m for m in members if rim_level - level[m] > np.log(MIN_FACTOR)]
-        around = {k for m in members for k in neighbours[m]} - set(members)
-        if not deep or len(around) < MIN_NEIGHBOURS:
-            continue  # the end of a row of samples: one neighbour proves nothing
-        low[deep] = True
-        for edge in {k for m in deep for k in neighbours[m]} - set(deep):
-            others = [k for k in neighbours[edge] if k not in deep]
-            if len(others) >= MIN_NEIGHBOURS and np.median(level[others]) - level[edge] > np.log(EDGE_FACTOR):
-                low[edge] = True
+
+    def neighbours(sample):
+        return index[start[sample] : start[sample + 1]].tolist()
+
+    deep = np.zeros(len(level), bool)
+    for sample in _candidates(level, start, index):
+        basin, overflow = _basin(sample, level, neighbours)
+        around = {k for m in basin for k in neighbours(m)} - basin
+        # at the end of a row of samples, one neighbour proves nothing
+        deep[sample] = overflow - level[sample] > np.log(MIN_FACTOR) and len(around) >= MIN_NEIGHBOURS
+    low = deep.copy()
+    for edge in {k for m in np.flatnonzero(deep) for k in neighbours(m) if not deep[k]}:
+        others = [k for k in neighbours(edge) if not deep[k]]
+        if len(others) >= MIN_NEIGHBOURS and np.median(level[others]) - level[edge] > np.log(EDGE_FACTOR):
+            low[edge] = True
     return low
 
 
-def _basins(level: np.ndarray, neighbours: list[list[int]]) -> list[tuple[list[int], float]]:
-    """Return the basins of at most `MAX_TOGETHER` samples, each with the level at which it overflows.
+def _candidates(level: np.ndarray, start: np.ndarray, index: np.ndarray) -> list[int]:
+    """Samples that may be deep: one neighbour is far above, or a basin may hold them all."""
+    count = np.diff(start)
+    far_above = np.zeros(len(level), bool)
+    some = count > 0
+    highest = np.maximum.reduceat(level[index], start[:-1][some])
+    far_above[some] = highest - level[some] > np.log(MIN_FACTOR)
+    return np.flatnonzero(far_above | (some & (count <= MAX_TOGETHER))).tolist()
 
-    Samples are flooded from the lowest up; a basin is closed by the sample that joins it to a
-    larger one.
+
+def _basin(sample: int, level: np.ndarray, neighbours) -> tuple[set[int], float]:
+    """Return the samples below the level at which the basin of `sample` overflows, and that level.
+
+    The basin is flooded from `sample`, always over the lowest sample at its shore, until it
+    holds more than `MAX_TOGETHER`.
     """
-    parent = [-1] * len(level)
-    members: dict[int, list[int] | None] = {}  # by root; None where there are too many
-    closed = []
-
-    def root(k):
-        while parent[k] != k:
-            parent[k] = parent[parent[k]]
-            k = parent[k]
-        return k
-
-    for sample in np.argsort(level, kind="stable").tolist():
-        joined = {root(k) for k in neighbours[sample] if parent[k] >= 0}
-        parent[sample] = sample
-        basins = [members.pop(r) for r in joined]
-        for r in joined:
-            parent[r] = sample
-        union = [sample] + [m for basin in basins if basin is not None for m in basin]
-        if None in basins or len(union) > MAX_TOGETHER:
-            closed += [(basin, float(level[sample])) for basin in basins if basin is not None]
-            members[sample] = None
-        else:
-            members[sample] = union
-    return closed
+    basin, shore = {sample}, set(neighbours(sample))
+    while shore and len(basin) <= MAX_TOGETHER:
+        lowest = min(shore, key=level.__getitem__)
+        basin.add(lowest)
+        shore = (shore | set(neighbours(lowest))) - basin
+    overflow = float(max(level[k] for k in basin)) if len(basin) > MAX_TOGETHER else -np.inf
+    return {k for k in basin if level[k] < overflow}, overflow
 
 
 def _neighbours(theta_o: np.ndarray, phi_o: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

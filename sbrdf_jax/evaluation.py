@@ -7,7 +7,7 @@ field of its own, registers its kernel for its record with `direction_kernel.reg
 """
 
 import functools
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Real
 from sbrdf_jax.encoding import decode
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, SpectralField
 from sbrdf_jax.representation.paper import compact_coefficient
-from sbrdf_jax.sinc import azimuth_distance, polar_distance, separable_weights
+from sbrdf_jax.sinc import Window, azimuth_distance, polar_distance, separable_weights
 
 CHUNK_BYTES = 128 * 2**20  # working memory of one chunk of directions
 MOST_AT_A_TIME = 2048  # directions; more leave the processor's cache
@@ -54,7 +54,9 @@ def evaluate(
         Between wavelengths the grid is a C1 cubic, the compact form its own basis; outside
         the measured range the value is NaN, never an extrapolation. Directions are not
         checked. At a pole, eq. (5) is not constant in phi_o between its nodes: its weights
-        do not sum to 1, and the paper does not renormalise them.
+        do not sum to 1, and the paper does not renormalise them. Taking the nearest image
+        leaves a corner of the field at the nodes of phi_o under the windows "none" and
+        "product"; "factor" has none there.
     """
     if direction_kernel.dispatch(type(result)) is direction_kernel.dispatch(object):
         raise TypeError(f"{type(result).__name__} cannot be evaluated: no kernel is registered for it")
@@ -143,7 +145,7 @@ def node_weights(grid: GriddedBRDF | SpectralField, theta_i, theta_o, phi_o):
     step_i = nodes_i[1] - nodes_i[0] if grid.interpolate_theta_i else 1.0
     distances = (along_i, polar_distance(theta_o, nodes_o), azimuth_distance(phi_o, num_phi))
     steps = (step_i, nodes_o[1] - nodes_o[0], 2 * np.pi / num_phi)
-    terms = separable_weights(distances, steps, grid.window)
+    terms = separable_weights(distances, steps, cast(Window, grid.window))
     if grid.interpolate_theta_i:
         return terms
     chosen = jax.nn.one_hot(nearest(theta_i, nodes_i), nodes_i.shape[0], dtype=nodes_i.dtype)
@@ -215,8 +217,7 @@ def slope_matrix(nodes: Float[Array, " node"]) -> Float[Array, "node node"]:
     weight_a = (2 * at - b - c) / ((a - b) * (a - c))
     weight_b = (2 * at - a - c) / ((b - a) * (b - c))
     weight_c = (2 * at - a - b) / ((c - a) * (c - b))
-    weights = (weight_a, weight_b, weight_c)
-    return sum(w[:, None] * unit[first + k] for k, w in enumerate(weights))
+    return weight_a[:, None] * unit[first] + weight_b[:, None] * unit[first + 1] + weight_c[:, None] * unit[first + 2]
 
 
 def evaluate_in_chunks(
@@ -252,6 +253,7 @@ def evaluate_in_chunks(
         MOST_AT_A_TIME,
     )
     value = np.empty((count, num_wavelengths))
+    result = jax.tree.map(jnp.asarray, result)  # to the device once, not with every chunk
     for start in range(0, count, size):
         part = [a[start : start + size] for a in flat]
         length = part[0].size

@@ -33,7 +33,7 @@ def dataset(group: h5py.Group, name: str, value, units: str, axes: list[h5py.Dat
     written.attrs["units"] = units
     for dimension, axis in enumerate(axes):
         written.dims[dimension].attach_scale(axis)
-        written.dims[dimension].label = axis.name.rsplit("/", 1)[-1]
+        written.dims[dimension].label = str(axis.name).rsplit("/", 1)[-1]
     return written
 
 
@@ -57,14 +57,43 @@ def write_mapping(group: h5py.Group, mapping: Mapping[str, Any], units: str) -> 
             group.attrs[name] = json.dumps(value)
 
 
+def group_of(group: h5py.Group, name: str) -> h5py.Group:
+    """Return a group below a group.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    found = group[name]
+    if not isinstance(found, h5py.Group):
+        raise ValueError(f"{group.name}/{name}: expected a group")
+    return found
+
+
+def dataset_of(group: h5py.Group, name: str) -> h5py.Dataset:
+    """Return a dataset below a group.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    found = group[name]
+    if not isinstance(found, h5py.Dataset):
+        raise ValueError(f"{group.name}/{name}: expected a dataset")
+    return found
+
+
+def attribute(item: h5py.Group | h5py.Dataset, name: str) -> Any:
+    """Return an attribute; text as str, a number or truth value as NumPy gives it."""
+    return item.attrs[name]
+
+
 def read(group: h5py.Group, name: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
     """Read one numeric dataset after a look at its kind, shape and size.
 
     Raises:
         ValueError: it is no array of numbers, has another shape than its axes, or declares far more than it holds.
     """
-    stored = group[name]
-    if not isinstance(stored, h5py.Dataset) or stored.dtype.kind not in "biuf":
+    stored = dataset_of(group, name)
+    if stored.dtype.kind not in "biuf":
         raise ValueError(f"{group.name}/{name}: expected an array of numbers")
     if shape is not None and stored.shape != shape:
         raise ValueError(f"{group.name}/{name}: found shape {stored.shape}, expected {shape}")
@@ -87,7 +116,7 @@ def read_datasets(group: h5py.Group) -> dict[str, np.ndarray]:
 
 def read_mapping(group: h5py.Group) -> dict[str, Any]:
     """Read what `write_mapping` wrote."""
-    found: dict[str, Any] = {name: json.loads(value) for name, value in group.attrs.items()}
+    found: dict[str, Any] = {name: json.loads(attribute(group, name)) for name in group.attrs}
     for name, item in group.items():
         if isinstance(item, h5py.Group):
             found[name] = read_mapping(item)

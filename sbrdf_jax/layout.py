@@ -11,7 +11,7 @@ from sbrdf_jax.coverage import Coverage
 from sbrdf_jax.encoding import coefficient_names, make_basis
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.harmonics import harmonic_orders
-from sbrdf_jax.hdf5 import dataset, degrees, read, scale
+from sbrdf_jax.hdf5 import attribute, dataset, dataset_of, degrees, read, scale
 from sbrdf_jax.lobes import LOBE_KINDS
 from sbrdf_jax.metrics import stored_numbers
 from sbrdf_jax.records import STATUS_TEXT, CompactBRDF, GriddedBRDF, SpectralBasis, SpectralField, Status
@@ -40,7 +40,7 @@ def write_field(group: h5py.Group, field: SpectralField, grid: h5py.Group) -> No
     """Write the spectral coefficients at the nodes of the grid."""
     names = coefficient_names(field.basis)
     index = scale(group, "coefficient", np.arange(len(names)), "1")
-    axes = [grid[f"{name}_deg"] for name in _ANGLES]
+    axes = [dataset_of(grid, f"{name}_deg") for name in _ANGLES]
     written = dataset(group, "coefficients", field.coefficient, "1/sr", [*axes, index])
     written.attrs["basis"] = field.basis.kind
     written.attrs["coefficient_order"] = ",".join(names)
@@ -105,24 +105,26 @@ def read_grid(group: h5py.Group) -> GriddedBRDF:
     wavelength_nm = read(group, "wavelength_nm")
     directions, lanes = tuple(map(len, axes)), (len(wavelength_nm),)
     return GriddedBRDF(
-        *map(np.deg2rad, axes),
+        theta_i=np.deg2rad(axes[0]),
+        theta_o=np.deg2rad(axes[1]),
+        phi_o=np.deg2rad(axes[2]),
         wavelength_nm=wavelength_nm,
         brdf=read(group, "brdf", (*directions, *lanes)),
         extrapolated=read(group, "extrapolated", directions),
         kkt_residual=read(group, "kkt_residual", lanes),
         num_steps=read(group, "num_steps", lanes),
         status=read(group, "status", lanes),
-        method=str(group.attrs["method"]),
-        window=str(group.attrs["window"]),
-        bilateral=bool(group.attrs["bilateral"]),
-        interpolate_theta_i=bool(group.attrs["interpolate_theta_i"]),
+        method=str(attribute(group, "method")),
+        window=str(attribute(group, "window")),
+        bilateral=bool(attribute(group, "bilateral")),
+        interpolate_theta_i=bool(attribute(group, "interpolate_theta_i")),
     )
 
 
 def read_field(group: h5py.Group, gridded: GriddedBRDF) -> SpectralField:
     """Read the spectral coefficients; their basis follows from its kind, the wavelengths and the count."""
-    stored = group["coefficients"]
-    basis = read_basis(stored.attrs["basis"], np.asarray(gridded.wavelength_nm), stored.shape[-1])
+    stored = dataset_of(group, "coefficients")
+    basis = read_basis(attribute(stored, "basis"), np.asarray(gridded.wavelength_nm), stored.shape[-1])
     shape = (*np.shape(gridded.brdf)[:3], stored.shape[-1])
     return SpectralField(
         gridded.theta_i,
@@ -137,15 +139,15 @@ def read_field(group: h5py.Group, gridded: GriddedBRDF) -> SpectralField:
 
 def read_compact(group: h5py.Group) -> CompactBRDF:
     """Read the compact form from its group alone."""
-    method = str(group.attrs["method"])
+    method = str(attribute(group, "method"))
     if method != "paper":
         raise UserError(f"{group.file.filename}: compact: method: found {method!r}, expected 'paper'")
     theta_i, wavelength_nm = read(group, "theta_i_deg"), read(group, "wavelength_nm")
-    max_degree = int(group.attrs["max_degree"])
+    max_degree = int(attribute(group, "max_degree"))
     lanes = (len(theta_i), len(read(group, "coefficient")))
     return CompactBRDF(
         theta_i=np.deg2rad(theta_i),
-        basis=read_basis(group.attrs["basis"], wavelength_nm, lanes[1]),
+        basis=read_basis(attribute(group, "basis"), wavelength_nm, lanes[1]),
         background=read(group, "background", (*lanes, (max_degree + 1) ** 2)),
         lobe_kind=read(group, "lobe_kind", lanes),
         lobe_height=read(group, "lobe_height", lanes),
@@ -154,7 +156,7 @@ def read_compact(group: h5py.Group) -> CompactBRDF:
         lobe_peak_theta_o=np.deg2rad(read(group, "lobe_peak_theta_o_deg", lanes[:1])),
         status=read(group, "status", lanes),
         max_degree=max_degree,
-        interpolate_theta_i=bool(group.attrs["interpolate_theta_i"]),
+        interpolate_theta_i=bool(attribute(group, "interpolate_theta_i")),
     )
 
 
@@ -173,19 +175,18 @@ def read_cleaning(group: h5py.Group) -> CleanReport:
         theta_i=np.deg2rad(read(group, "covered_theta_i_deg")),
         count=read(group, "covered_count"),
         theta_o_range=(float(low), float(high)),
-        covers_both_half_planes=bool(group.attrs["covers_both_half_planes"]),
-        covered=tuple(json.loads(group.attrs["covered"])),
-        missing=tuple(json.loads(group.attrs["missing"])),
+        covers_both_half_planes=bool(attribute(group, "covers_both_half_planes")),
+        covered=tuple(json.loads(attribute(group, "covered"))),
+        missing=tuple(json.loads(attribute(group, "missing"))),
     )
-    entries = (
-        CleanEntry(**entry | {"examples": tuple(entry["examples"])}) for entry in json.loads(group.attrs["entries"])
-    )
+    stored = json.loads(attribute(group, "entries"))
+    entries = (CleanEntry(**entry | {"examples": tuple(entry["examples"])}) for entry in stored)
     return CleanReport(
         flag=read(group, "flag"),
         entries=tuple(entries),
         dead_wavelength_nm=read(group, "dead_wavelength_nm"),
-        num_rows=int(group.attrs["num_rows"]),
-        num_kept=int(group.attrs["num_kept"]),
-        bilateral=bool(group.attrs["bilateral"]),
+        num_rows=int(attribute(group, "num_rows")),
+        num_kept=int(attribute(group, "num_kept")),
+        bilateral=bool(attribute(group, "bilateral")),
         coverage=coverage,
     )

@@ -54,7 +54,7 @@ def measure(
     Args:
         gridded: The resampled field.
         field: Its spectral coefficients, for the split of the error.
-        compact: Its compact form; without it only the grid is measured.
+        compact: Its compact form, of the wavelengths that are finite; without it only the grid is measured.
         absolute: False where values are only proportional to a BRDF: albedo then warns of nothing.
         seed: Of the random directions.
 
@@ -72,9 +72,11 @@ def measure(
             value |= error_split(compact, field, gridded)
         share, depth, reciprocity = off_node_scores(compact, seed=seed)
         value |= {"negative_share": share, "negative_depth": depth, "reciprocity_error_compact": reciprocity}
-        value["albedo_compact"] = albedo(compact)
+        of_compact = albedo(compact)
+        value["albedo_compact"] = np.full(value["albedo"].shape, np.nan)
+        value["albedo_compact"][:, live_wavelengths(gridded)] = of_compact
         if absolute:
-            warnings += albedo_warnings(value["albedo_compact"], compact, "compact")
+            warnings += albedo_warnings(of_compact, compact, "compact")
     return Metrics({name: np.asarray(v) for name, v in value.items()}, tuple(warnings))
 
 
@@ -109,13 +111,13 @@ def error_at_nodes(compact: CompactBRDF, gridded: GriddedBRDF, matching: colour.
     """Compare compact form and grid at the grid's nodes: eq. (18), median relative error, Delta E 2000 under D65.
 
     All nodes count, copies at the poles and at 360 degrees included, as the paper counts;
-    wavelengths count where the whole grid is finite.
+    wavelengths count where the whole grid is finite, which are those of the compact form.
     """
     live = live_wavelengths(gridded)
     error_energy, energy, deviation, delta_e = [], [], [], []
     for i, theta_i in enumerate(np.asarray(gridded.theta_i)):
         original = np.asarray(gridded.brdf[i])[..., live]
-        reconstructed = on_axes(compact, theta_i, gridded.theta_o, gridded.phi_o)[..., live]
+        reconstructed = on_axes(compact, theta_i, gridded.theta_o, gridded.phi_o)
         error_energy.append(((reconstructed - original) ** 2).sum())
         energy.append((original**2).sum())
         deviation.append(relative_deviation(reconstructed, original).ravel())
@@ -136,7 +138,7 @@ def error_at_nodes(compact: CompactBRDF, gridded: GriddedBRDF, matching: colour.
 
 def live_wavelengths(gridded: GriddedBRDF) -> np.ndarray:
     """Mask of the wavelengths at which the whole grid is finite; the others are lanes that failed, and say so."""
-    return np.isfinite(np.asarray(gridded.brdf)).all(axis=(0, 1, 2))
+    return np.all(np.isfinite(np.asarray(gridded.brdf)), axis=(0, 1, 2))
 
 
 def error_between(compact: CompactBRDF, gridded: GriddedBRDF) -> dict:
@@ -150,7 +152,7 @@ def error_between(compact: CompactBRDF, gridded: GriddedBRDF) -> dict:
 
     def at(incidence):
         original = on_axes(gridded, incidence, theta_o, phi_o)[..., live]
-        reconstructed = on_axes(compact, incidence, theta_o, phi_o)[..., live]
+        reconstructed = on_axes(compact, incidence, theta_o, phi_o)
         return relative_error(((reconstructed - original) ** 2).sum(), (original**2).sum())
 
     midway = midpoints(theta_i)
@@ -172,16 +174,16 @@ def error_split(compact: CompactBRDF, field: SpectralField, gridded: GriddedBRDF
     live = live_wavelengths(gridded)
     parts = {"error_spectral": [], "error_background": [], "error_lobe": []}
     for i in range(len(gridded.theta_i)):
-        original = np.asarray(gridded.brdf[i])
-        energy = (original[..., live] ** 2).sum()
-        slice_parts = _slice_split(compact, field, jnp.asarray(original), jnp.asarray(live), i)
+        original = np.asarray(gridded.brdf[i])[..., live]
+        energy = (original**2).sum()
+        slice_parts = _slice_split(compact, field, jnp.asarray(original), i)
         for name, error in zip(parts, slice_parts, strict=True):
             parts[name].append(relative_error(float(error), energy))
     return {name: np.array(values) for name, values in parts.items()}
 
 
 @jax.jit
-def _slice_split(compact, field, original, live, i):
+def _slice_split(compact, field, original, i):
     """Squared errors of one incident angle: spectral truncation, background, lobe."""
     theta_o, phi_o = jnp.meshgrid(jnp.asarray(field.theta_o), jnp.asarray(field.phi_o), indexing="ij")
     at_node = jax.vmap(jax.vmap(functools.partial(compact_coefficient, compact, i)))
@@ -194,7 +196,7 @@ def _slice_split(compact, field, original, live, i):
     spectral = original - decode(wanted, field.basis)
     background = decode(jnp.where(inside, 0.0, misfit), field.basis)
     lobe = decode(jnp.where(inside, misfit, 0.0), field.basis)
-    return tuple(jnp.where(live, part**2, 0.0).sum() for part in (spectral, background, lobe))
+    return tuple((part**2).sum() for part in (spectral, background, lobe))
 
 
 def stored_numbers(compact: CompactBRDF) -> int:

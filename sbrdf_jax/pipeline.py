@@ -10,12 +10,12 @@ import numpy as np
 from sbrdf_jax.cleaning import CleanResult, clean
 from sbrdf_jax.encoding import coefficients_allowed, encode_field, make_basis
 from sbrdf_jax.grid import Grid, make_grid
-from sbrdf_jax.metrics import measure
+from sbrdf_jax.metrics import live_wavelengths, measure
 from sbrdf_jax.options import RunOptions
 from sbrdf_jax.plan import PlanRow, plan_run
 from sbrdf_jax.progress import Progress, StageClock
-from sbrdf_jax.records import STATUS_TEXT, RawSamples, SpectralBasis, Status
-from sbrdf_jax.representation import represent
+from sbrdf_jax.records import STATUS_TEXT, GriddedBRDF, RawSamples, Status
+from sbrdf_jax.representation import represent_with_plan
 from sbrdf_jax.resampling import resample
 from sbrdf_jax.runtime import compile_clock
 from sbrdf_jax.store import RunResult
@@ -29,7 +29,6 @@ class Prepared:
 
     cleaned: CleanResult
     grid: Grid
-    basis: SpectralBasis
     rows: list[PlanRow]
     warnings: tuple[str, ...]
 
@@ -42,22 +41,20 @@ def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
         options: Resolved options.
 
     Returns:
-        The cleaned samples, the grid, the spectral basis, the plan, and what a user must be told.
+        The cleaned samples, the grid, the plan, and what a user must be told.
 
     Raises:
         UserError: The measurement is not enough for a grid.
     """
     cleaned = clean(raw, bilateral=options.input.bilateral, method=options.resample.method)
     grid = make_grid(cleaned.samples, options.grid, bilateral=cleaned.report.bilateral)
-    wanted = options.encode.coefficients
-    wavelengths = cleaned.samples.wavelength_nm
-    allowed = coefficients_allowed(len(wavelengths), int(wanted), options.encode.basis)
-    basis = make_basis(wavelengths, allowed.kind, allowed.coefficients)
+    num_live = len(raw.wavelength_nm) - len(cleaned.report.dead_wavelength_nm)
+    allowed = coefficients_allowed(num_live, int(options.encode.coefficients), options.encode.basis)
     rows = plan_run(cleaned.samples, raw.num_samples, grid, allowed.coefficients, options)
     warnings = [f"not measured: {text}" for text in cleaned.report.coverage.missing]
     if allowed.warning:
         warnings.append(allowed.warning)
-    return Prepared(cleaned, grid, basis, rows, tuple(warnings))
+    return Prepared(cleaned, grid, rows, tuple(warnings))
 
 
 def process(raw: RawSamples, ready: Prepared, options: RunOptions, progress: Progress) -> RunResult:
@@ -82,12 +79,15 @@ def process(raw: RawSamples, ready: Prepared, options: RunOptions, progress: Pro
             lambda done, total: progress.update(f"{done} of {total} wavelengths converged"),
         )
 
+    live = finite_part(gridded)
     with _timed(progress, timing, "encode"):
-        field = encode_field(gridded, ready.basis)
-        progress.update(f"{np.shape(field.coefficient)[-1]} coefficients, basis {ready.basis.kind}")
+        basis = make_basis(np.asarray(live.wavelength_nm), options.encode.basis, int(options.encode.coefficients))
+        field = encode_field(live, basis)
+        used = np.shape(field.coefficient)[-1]
+        progress.update(f"{used} coefficients, basis {basis.kind}")
 
     with _timed(progress, timing, "represent"):
-        compact = represent(field, options.represent)
+        compact, searched = represent_with_plan(field, options.represent)
         progress.update(count_statuses(compact.status))
 
     with _timed(progress, timing, "measure"):
@@ -106,12 +106,25 @@ def process(raw: RawSamples, ready: Prepared, options: RunOptions, progress: Pro
             "num_samples": raw.num_samples,
             "notes": list(raw.notes),
         },
-        plan={row.stage + " " + row.what: dataclasses.asdict(row) for row in ready.rows}
-        | {"coefficients_used": np.shape(field.coefficient)[-1]},
+        plan={
+            "needed": {f"{row.stage} {row.what}": dataclasses.asdict(row) for row in ready.rows},
+            "represent": searched,
+            "coefficients_used": used,
+        },
         timing=timing,
         warnings=ready.warnings + metrics.warnings,
         source_sha256=raw.source_sha256,
     )
+
+
+def finite_part(gridded: GriddedBRDF) -> GriddedBRDF:
+    """Return the wavelengths of a grid that are finite, so that a lane that failed spoils no spectrum."""
+    live = live_wavelengths(gridded)
+    if live.all():
+        return gridded
+    per_wavelength = ("wavelength_nm", "kkt_residual", "num_steps", "status")
+    parts = {name: np.asarray(getattr(gridded, name))[live] for name in per_wavelength}
+    return dataclasses.replace(gridded, brdf=np.asarray(gridded.brdf)[..., live], **parts)
 
 
 def count_statuses(status) -> str:

@@ -7,6 +7,7 @@ a fit is a JAX pytree: its arrays may be traced, its other fields are static.
 
 import dataclasses
 import enum
+import typing
 from typing import Any
 
 import jax
@@ -34,6 +35,7 @@ STATUS_TEXT = {
 }
 
 
+@typing.dataclass_transform(frozen_default=True)
 def pytree(*, static: tuple[str, ...] = ()):
     """Class decorator: a frozen dataclass that JAX may trace, but for the fields `static`."""
 

@@ -20,7 +20,18 @@ import numpy as np
 from sbrdf_jax.cleaning import CleanReport
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.files import whole_file
-from sbrdf_jax.hdf5 import dataset, degrees, one_line_errors, read_datasets, read_mapping, scale, write_mapping
+from sbrdf_jax.hdf5 import (
+    attribute,
+    dataset,
+    dataset_of,
+    degrees,
+    group_of,
+    one_line_errors,
+    read_datasets,
+    read_mapping,
+    scale,
+    write_mapping,
+)
 from sbrdf_jax.layout import (
     read_cleaning,
     read_compact,
@@ -78,15 +89,16 @@ def write_result(file: h5py.File, result: RunResult) -> None:
     file.attrs["created_utc"] = result.created_utc
     file.attrs["versions"] = json.dumps(dict(result.versions), sort_keys=True)
     file.attrs["warnings"] = json.dumps(list(result.warnings))
-    write_grid(file.create_group("grid"), result.gridded)
+    grid = file.create_group("grid")
+    write_grid(grid, result.gridded)
     if result.field is not None:
-        write_field(file.create_group("spectral"), result.field, file["grid"])
+        write_field(file.create_group("spectral"), result.field, grid)
     if result.compact is not None:
         write_compact(file.create_group("compact"), result.compact)
     write_input(file.create_group("input"), result)
-    write_metrics(file.create_group("metrics"), result, file["grid"])
+    write_metrics(file.create_group("metrics"), result, grid)
     if result.validation:
-        write_validation(file.create_group("validation"), result.validation, file["grid"])
+        write_validation(file.create_group("validation"), result.validation, grid)
     write_mapping(file.create_group("plan"), result.plan, "1")
     write_mapping(file.create_group("timing"), result.timing, "s")
 
@@ -102,7 +114,7 @@ def write_input(group: h5py.Group, result: RunResult) -> None:
 def write_metrics(group: h5py.Group, result: RunResult, grid: h5py.Group) -> None:
     """Write every metric with the axes and the unit that `metrics` names for it."""
     theta_i = np.asarray(result.gridded.theta_i)
-    axes = {"theta_i": grid["theta_i_deg"], "wavelength": grid["wavelength_nm"]}
+    axes = {"theta_i": dataset_of(grid, "theta_i_deg"), "wavelength": dataset_of(grid, "wavelength_nm")}
     if "relative_error_between_theta_i" in result.metrics:
         midway = degrees((theta_i[:-1] + theta_i[1:]) / 2)
         axes["theta_i_between"] = scale(group, "theta_i_between_deg", midway, "deg")
@@ -116,7 +128,7 @@ def write_validation(group: h5py.Group, validation: Mapping[str, np.ndarray], gr
     """Write held-out predictions, a row for each input row in file order."""
     row = scale(group, "row", np.arange(len(next(iter(validation.values())))), "1")
     for name, value in validation.items():
-        axes = [row, grid["wavelength_nm"]][: np.ndim(value)]
+        axes = [row, dataset_of(grid, "wavelength_nm")][: np.ndim(value)]
         dataset(group, name, value, "1/sr" if np.ndim(value) == 2 else "1", axes)
 
 
@@ -135,7 +147,7 @@ def open_result(path: str | os.PathLike):
         found = file.attrs.get("schema_name")
         if found != SCHEMA_NAME:
             raise UserError(f"{path}: schema_name: found {found!r}, expected {SCHEMA_NAME!r}: this is not a result")
-        version = int(file.attrs["schema_version"])
+        version = int(attribute(file, "schema_version"))
         if version > SCHEMA_VERSION:
             raise UserError(
                 f"{path}: schema_version: found {version}, expected {SCHEMA_VERSION} or older: "
@@ -152,23 +164,24 @@ def load(path: str | os.PathLike) -> RunResult:
         UserError: as `open_result`, or the file is damaged.
     """
     with open_result(path) as file:
-        gridded = read_grid(file["grid"])
-        compact = read_compact(file["compact"]) if "compact" in file else None
+        source = group_of(file, "input")
+        gridded = read_grid(group_of(file, "grid"))
+        compact = read_compact(group_of(file, "compact")) if "compact" in file else None
         return RunResult(
             gridded=gridded,
-            field=read_field(file["spectral"], gridded) if "spectral" in file else None,
+            field=read_field(group_of(file, "spectral"), gridded) if "spectral" in file else None,
             compact=compact,
-            metrics=read_datasets(file["metrics"]),
-            clean=read_cleaning(file["input/cleaning"]) if "cleaning" in file["input"] else None,
-            input={name: json.loads(value) for name, value in file["input"].attrs.items()},
-            validation=read_datasets(file["validation"]) if "validation" in file else {},
-            plan=read_mapping(file["plan"]),
-            timing=read_mapping(file["timing"]),
-            warnings=tuple(json.loads(file.attrs["warnings"])),
-            config=str(file.attrs["config"]),
-            source_sha256=str(file.attrs["source_sha256"]),
-            created_utc=str(file.attrs["created_utc"]),
-            versions=json.loads(file.attrs["versions"]),
+            metrics=read_datasets(group_of(file, "metrics")),
+            clean=read_cleaning(group_of(source, "cleaning")) if "cleaning" in source else None,
+            input={name: json.loads(attribute(source, name)) for name in source.attrs},
+            validation=read_datasets(group_of(file, "validation")) if "validation" in file else {},
+            plan=read_mapping(group_of(file, "plan")),
+            timing=read_mapping(group_of(file, "timing")),
+            warnings=tuple(json.loads(attribute(file, "warnings"))),
+            config=str(attribute(file, "config")),
+            source_sha256=str(attribute(file, "source_sha256")),
+            created_utc=str(attribute(file, "created_utc")),
+            versions=json.loads(attribute(file, "versions")),
         )
 
 
@@ -183,7 +196,7 @@ def load_stage(path: str | os.PathLike, stage: str) -> GriddedBRDF | CompactBRDF
     with open_result(path) as file:
         if stage not in file:
             raise UserError(f"{path}: stage {stage}: not in this result, found {', '.join(file)}")
-        return readers[stage](file[stage])
+        return readers[stage](group_of(file, stage))
 
 
 def describe(path: str | os.PathLike) -> list[str]:

@@ -97,7 +97,8 @@ def done_table(result: RunResult) -> Table:
     rows = [("grid", f"{axes}, method {grid.method}, {folded}, window {grid.window}")]
     if not grid.interpolate_theta_i:
         rows.append(("", "theta_i as measured, nothing interpolated over it"))
-    residual, steps = np.nanmax(np.asarray(grid.kkt_residual)), int(np.max(grid.num_steps))
+    residual = np.asarray(grid.kkt_residual, float)
+    residual, steps = np.max(residual[np.isfinite(residual)], initial=0.0), int(np.max(grid.num_steps))
     certificate = f"KKT residual at most {residual:.1e}, at most {steps} steps"
     rows.append(("solver", f"{certificate}; {count_statuses(grid.status)}"))
     rows.append(("nodes", coverage_text(grid.extrapolated)))

@@ -101,8 +101,8 @@ def test_delta_e_2000_meets_published_pairs():
     pairs = [((50, 2.6772, -79.7751), (50, 0, -82.7485), 2.0425), ((50, 2.5, 0), (73, 25, -18), 27.1492)]
     for lab_a, lab_b, expected in pairs:
         white = colour.XYZ_to_xy(matching.white)
-        spectra = [basis @ (colour.Lab_to_XYZ(np.array(lab), white) * 100) / np.pi for lab in (lab_a, lab_b)]
-        np.testing.assert_allclose(ours.delta_e_2000(*spectra, matching), expected, atol=1e-4)
+        a, b = (basis @ (colour.Lab_to_XYZ(np.array(lab), white) * 100) / np.pi for lab in (lab_a, lab_b))
+        np.testing.assert_allclose(ours.delta_e_2000(a, b, matching), expected, atol=1e-4)
 
 
 def test_shapes_negative_values_and_exposure():

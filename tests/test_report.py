@@ -13,9 +13,10 @@ from small_results import small_compact, small_field, small_grid
 from sbrdf_jax import builtin, colour, config, store
 from sbrdf_jax.cleaning import clean
 from sbrdf_jax.cli import main
-from sbrdf_jax.evaluation import evaluate_on_axes
+from sbrdf_jax.evaluation import evaluate, evaluate_on_axes
+from sbrdf_jax.lobes import LOBE_KINDS
 from sbrdf_jax.metrics import measure
-from sbrdf_jax.report import draw_figures, fine_grid, hemisphere, page, write_page
+from sbrdf_jax.report import draw_figures, fine_grid, hemisphere, lobe_fits, page, write_page
 from sbrdf_jax.store import RunResult
 from sbrdf_jax.summary import error_table, summary_text, table_text, time_table
 
@@ -36,8 +37,8 @@ def result(raw):
     """A result on a coarse grid that holds the truth, with a random compact form: quick, and everything is there."""
     rng = np.random.default_rng(5)
     grid = small_grid(rng, wavelength_nm=raw.wavelength_nm)
-    mesh = np.meshgrid(grid.theta_i, grid.theta_o, grid.phi_o, indexing="ij")
-    brdf = builtin.true_brdf("amber_glass", *mesh, raw.wavelength_nm)
+    theta_i, theta_o, phi_o = np.meshgrid(grid.theta_i, grid.theta_o, grid.phi_o, indexing="ij")
+    brdf = builtin.true_brdf("amber_glass", theta_i, theta_o, phi_o, raw.wavelength_nm)
     flags = np.array(grid.extrapolated)
     flags[-1] = 2
     grid = dataclasses.replace(grid, brdf=brdf, extrapolated=flags)
@@ -73,10 +74,21 @@ def plain(result):
     return dataclasses.replace(result, gridded=grid, field=None, compact=None, metrics={}, clean=None, config="")
 
 
+def fit_in_no_time(part, options):
+    """Stands in for `represent`, whose compilation would take most of the time of these tests."""
+    count = np.shape(part.basis.synthesis)[0]
+    return small_compact(
+        np.random.default_rng(LOBE_KINDS.index(options.lobe)), theta_i=np.asarray(part.theta_i), coefficients=count,
+        interpolate_theta_i=False, max_degree=options.max_degree, wavelength_nm=np.asarray(part.basis.wavelength_nm),
+    )  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def drawn(result, raw, tmp_path_factory):
     """The page of one result, drawn once for all tests that look at it."""
-    return write_page([("glass", result)], tmp_path_factory.mktemp("report") / "glass", raw=raw)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lobe_fits, "represent", fit_in_no_time)
+        return write_page([("glass", result)], tmp_path_factory.mktemp("report") / "glass", raw=raw)
 
 
 class Outline(html.parser.HTMLParser):
@@ -195,7 +207,8 @@ def test_total_variation_of_known_fields():
 
 def test_the_window_calms_the_rings():
     axis = [np.radians(np.arange(0, n + 1, 7.5)) for n in (90, 90, 360)]
-    brdf = builtin.true_brdf("amber_glass", *np.meshgrid(*axis, indexing="ij"), np.array([550.0, 600.0]))
+    theta_i, theta_o, phi_o = np.meshgrid(*axis, indexing="ij")
+    brdf = builtin.true_brdf("amber_glass", theta_i, theta_o, phi_o, np.array([550.0, 600.0]))
     grid = dataclasses.replace(
         small_grid(np.random.default_rng(0)), theta_i=axis[0], theta_o=axis[1], phi_o=axis[2], brdf=brdf,
         wavelength_nm=np.array([550.0, 600.0]), extrapolated=np.zeros(brdf.shape[:3], int),
@@ -221,6 +234,30 @@ def test_screen_values_are_those_of_colour_science():
 
     linear = np.linspace(0, 1, 101)
     np.testing.assert_allclose(hemisphere.encode_srgb(linear), colour_science.cctf_encoding(linear), atol=1e-6)
+
+
+def test_lobe_kinds_are_fitted_one_by_one_at_one_incidence(result, monkeypatch):
+    asked = []
+
+    def represent(part, options):
+        asked.append((np.shape(part.coefficient)[0], part.interpolate_theta_i, options.max_degree, options.lobe))
+        return fit_in_no_time(part, options)
+
+    monkeypatch.setattr(lobe_fits, "represent", represent)
+    fits = lobe_fits.fit_lobe_kinds(result.field, result.gridded, 2, (1, 2))
+    assert asked == [(1, False, degree, kind) for degree in (1, 2) for kind in LOBE_KINDS[1:]]
+    grid = result.gridded
+    mesh = np.meshgrid(grid.theta_i[2:3], grid.theta_o, grid.phi_o, indexing="ij")
+    value = np.asarray(evaluate(fits[4].compact, *mesh))
+    eta = np.linalg.norm(value - grid.brdf[2:3]) / np.linalg.norm(grid.brdf[2:3])
+    assert fits[4].error == pytest.approx(eta, rel=1e-12)
+
+
+@pytest.mark.slow
+def test_lobe_kinds_with_the_real_fit(result):
+    fits = lobe_fits.fit_lobe_kinds(result.field, result.gridded, 0, (1,))
+    assert [fit.kind for fit in fits] == list(LOBE_KINDS[1:])
+    assert all(0 < fit.error < 0.2 for fit in fits)
 
 
 def test_summary_names_every_incident_angle_however_bad(result):

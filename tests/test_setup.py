@@ -21,9 +21,9 @@ def test_annotations_of_the_package_are_enforced():
 def test_jax_is_strict_and_float64():
     assert jnp.ones(3).dtype == jnp.float64
     with pytest.raises(ValueError, match="rank_promotion"):
-        jnp.ones(3) + jnp.ones((2, 3))
+        _ = jnp.ones(3) + jnp.ones((2, 3))
     with pytest.raises(ValueError, match="dtype_promotion"):
-        jnp.ones(3) + jnp.ones(3, dtype=int)
+        _ = jnp.ones(3) + jnp.ones(3, dtype=int)
 
 
 @pytest.mark.parametrize("python", ["3.11", "3.12", "3.13"])

@@ -19,6 +19,7 @@ from sbrdf_jax.cleaning import clean
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.evaluation import evaluate_in_chunks
 from sbrdf_jax.files import whole_file
+from sbrdf_jax.hdf5 import attribute, dataset_of
 from sbrdf_jax.metrics import METRIC_AXES, stored_numbers
 from sbrdf_jax.records import RawSamples
 
@@ -27,8 +28,7 @@ def raw_samples(rng, count=30) -> RawSamples:
     value = rng.uniform(0.1, 1.0, (count, len(UNIFORM_NM)))
     value[3, 2], value[4, 1] = np.nan, -0.1
     theta_i, theta_o, phi_o = rng.choice([0.1, 0.4, 0.9], count), rng.uniform(0, 1.5, count), rng.uniform(0, 6, count)
-    names = {"quantity": "brdf", "source": "made up", "source_format": "csv", "source_sha256": "ab" * 32}
-    return RawSamples(theta_i, theta_o, phi_o, UNIFORM_NM, value, np.arange(count), **names)
+    return RawSamples(theta_i, theta_o, phi_o, UNIFORM_NM, value, np.arange(count), "brdf", "made up", "csv", "ab" * 32)
 
 
 @pytest.fixture
@@ -115,14 +115,14 @@ def test_the_layout_is_the_contracts(tmp_path, result):
         for name in ("config", "config_sha256", "source_sha256", "created_utc", "versions"):
             assert isinstance(file.attrs[name], str)
         for name, shape in shapes.items():
-            assert file[name].shape == shape, name
-        assert file["grid/brdf"].chunks == (1, 5, 13, 11)
-        assert file["grid/brdf"].dtype == np.float64
+            assert dataset_of(file, name).shape == shape, name
+        assert dataset_of(file, "grid/brdf").chunks == (1, 5, 13, 11)
+        assert dataset_of(file, "grid/brdf").dtype == np.float64
         assert file["spectral/coefficients"].attrs["basis"] == "fourier"
         assert file["spectral/coefficients"].attrs["coefficient_order"] == "a_0,a_1,b_1,a_2,b_2"
         assert file["compact/lobe_kind"].attrs["names"] == "none,angle_squared,tan_squared,tan"
         np.testing.assert_array_equal(
-            file["compact/background"].attrs["harmonic_order"][:4], [[0, 0], [1, -1], [1, 0], [1, 1]]
+            attribute(dataset_of(file, "compact/background"), "harmonic_order")[:4], [[0, 0], [1, -1], [1, 0], [1, 1]]
         )
         assert file["compact"].attrs["method"] == "paper"
         assert file["compact/status"].attrs["names"] == "ok,max_steps,nonfinite,skipped,clamped,no_lobe"
@@ -149,8 +149,9 @@ def test_the_compact_group_alone_is_enough(tmp_path, rng, result):
     compact = store.load_stage(tmp_path / "part.h5", "compact")
     directions = rng.uniform(0, 1.5, (3, 20))
     wavelength = np.array([400.0, 555.5])
-    expected = evaluate_in_chunks(result.compact, *directions, wavelength, chunk_size=20)
-    found = evaluate_in_chunks(compact, *directions, wavelength, chunk_size=20)
+    theta_i, theta_o, phi_o = directions
+    expected = evaluate_in_chunks(result.compact, theta_i, theta_o, phi_o, wavelength, chunk_size=20)
+    found = evaluate_in_chunks(compact, theta_i, theta_o, phi_o, wavelength, chunk_size=20)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
     with pytest.raises(UserError, match="stage grid: not in this result"):
         store.load_stage(tmp_path / "part.h5", "grid")

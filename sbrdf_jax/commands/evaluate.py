@@ -57,8 +57,8 @@ def run(args: argparse.Namespace) -> int:
     with whole_file(output) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
         file.write(",".join([*COLUMNS, *names]) + "\n")
         for start in range(0, len(texts), ROWS_AT_A_TIME):
-            part = radians[start : start + ROWS_AT_A_TIME]
-            value = evaluate_in_chunks(stage, *part.T, wanted)
+            theta_i, theta_o, phi_o = radians[start : start + ROWS_AT_A_TIME].T
+            value = evaluate_in_chunks(stage, theta_i, theta_o, phi_o, wanted)
             for text, row in zip(texts[start : start + ROWS_AT_A_TIME], value.tolist(), strict=True):
                 file.write(",".join([*text, *map(repr, row)]) + "\n")
     print(f"{output}: {len(texts)} directions x {len(names)} wavelengths, {args.stage} stage")

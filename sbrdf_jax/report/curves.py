@@ -74,9 +74,9 @@ def ring_curves(fine: FineGrid, gridded: GriddedBRDF, effect: RingEffect) -> Any
     angle, plain = fine.plane(fine.plain, 0)
     _, windowed = fine.plane(fine.windowed, 0)
     nodes, at_nodes = nodes_in_plane(gridded, fine.incidences[0].index, fine.wavelength.index)
-    label = f"no window: total variation {effect.plain / effect.nodes:.2f} × the nodes'"
+    label = f"no window: total variation {effect.ratio(effect.plain):.2f} × the nodes'"
     axes.plot(np.degrees(angle), plain, color=VERMILLION, linestyle=LINES[1], label=label)
-    label = f"window “{gridded.window}”: {effect.windowed / effect.nodes:.2f} ×"
+    label = f"window “{gridded.window}”: {effect.ratio(effect.windowed):.2f} ×"
     axes.plot(np.degrees(angle), windowed, color=BLUE, label=label)
     axes.plot(nodes, at_nodes, color=INK, marker="o", markersize=3.6, linewidth=0, label="nodes of the grid")
     plane_axis(axes)
@@ -89,15 +89,19 @@ def ring_curves(fine: FineGrid, gridded: GriddedBRDF, effect: RingEffect) -> Any
     return figure
 
 
-def lobe_kinds(fine: FineGrid, fits: Sequence[KindFit]) -> Any:
+def lobe_kinds(fine: FineGrid, gridded: GriddedBRDF, fits: Sequence[KindFit]) -> Any:
     """Figure 10: the original against its compact form with each lobe kind, at the first incidence; a panel per L."""
     degrees = list(dict.fromkeys(fit.max_degree for fit in fits))
-    figure = new_figure(width=9.6, height=4.3)
+    figure = new_figure(width=9.6, height=4.9)
     panels = figure.subplots(1, len(degrees), sharey=True, squeeze=False)[0]
     angle, original = fine.plane(fine.windowed, 0)
+    nodes, at_nodes = nodes_in_plane(gridded, fine.incidences[0].index, fine.wavelength.index)
     theta_i, phi_o = np.full(angle.shape, fine.incidences[0].value), np.where(angle < 0, 0.0, np.pi)
     for axes, degree in zip(panels, degrees, strict=True):
-        axes.plot(np.degrees(angle), original, color=INK, linewidth=2.4, label="orig")
+        axes.plot(np.degrees(angle), original, color=INK, linewidth=2.2, label="orig, interpolated")
+        axes.plot(
+            nodes, at_nodes, color=INK, marker="o", markersize=4.5, linewidth=0, label="orig, nodes (η is of these)"
+        )
         shown = [fit for fit in fits if fit.max_degree == degree]
         for fit, color, line in zip(shown, SERIES, LINES[1:], strict=False):
             value = evaluate_in_chunks(fit.compact, theta_i, np.abs(angle), phi_o, chunk_size=CHUNK_SIZE)
@@ -107,8 +111,9 @@ def lobe_kinds(fine: FineGrid, fits: Sequence[KindFit]) -> Any:
         axes.set_xlabel("θ in the plane of incidence [deg]")
         axes.set_title(f"L = {degree}", loc="center")
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), fontsize=9)
-    panels[0].set_ylabel(f"BRDF [1/sr] at {fine.wavelength.text}")
-    figure.suptitle(f"Original and compact form, $\\theta_i$ = {fine.incidences[0].text}", fontweight="bold")
+    panels[0].set_ylabel("BRDF [1/sr]")
+    title = f"Original and compact form, $\\theta_i$ = {fine.incidences[0].text}, {fine.wavelength.text}"
+    figure.suptitle(title, fontweight="bold")
     return figure
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from sbrdf_jax.config import parse_config
 from sbrdf_jax.cutoff import CutoffSpectrum, cutoff_warnings, measure_cutoff
 from sbrdf_jax.evaluation import evaluate_in_chunks
-from sbrdf_jax.records import GriddedBRDF, RawSamples
+from sbrdf_jax.records import GriddedBRDF, RawSamples, SpectralField
 from sbrdf_jax.report import curves, hemisphere, quality
-from sbrdf_jax.report.fine_grid import interpolate_finely, pick_incidences, ring_effect
+from sbrdf_jax.report.fine_grid import finite_wavelengths, interpolate_finely, pick_incidences, ring_effect
 from sbrdf_jax.report.lobe_fits import fit_lobe_kinds
 from sbrdf_jax.report.style import save_figure, style_context
 from sbrdf_jax.store import RunResult
@@ -64,10 +64,11 @@ def draw(result: RunResult, folder: Path, samples: RawSamples | None = None, *, 
 
 
 def _sketches(result: RunResult, samples: RawSamples | None) -> Iterator[_Sketch]:
-    if result.gridded.method == "paper":  # other methods are not the interpolation of their nodes
+    # other methods are not the interpolation of their nodes
+    if result.gridded.method == "paper" and finite_wavelengths(result.gridded).size:
         yield from _of_interpolation(result, samples)
     if result.field is not None:
-        yield _spectra(result)
+        yield _spectra(result, result.field)
     if "relative_error" in result.metrics:
         yield _errors(result)
     yield from _of_samples(result, samples)
@@ -90,13 +91,14 @@ def _of_interpolation(result: RunResult, samples: RawSamples | None) -> Iterator
         f"without the window and {effect.windowed:.4g} rad/sr with it; straight lines between the nodes have "
         f"{effect.nodes:.4g}."
     )
-    yield _Sketch(
-        "color_maps",
-        hemisphere.color_maps(fine, grid, effect),
-        "In colour",
-        "The interpolated field without and with the window of eq. 17 (the paper's figures 8 and 9). Each incident "
-        f"angle has one exposure for both; at 1 × a perfect diffuser is white. {numbers}",
-    )
+    if np.isfinite(fine.windowed).all():  # else no wavelength is visible
+        yield _Sketch(
+            "color_maps",
+            hemisphere.color_maps(fine, grid, effect),
+            "In colour",
+            "The interpolated field without and with the window of eq. 17 (the paper's figures 8 and 9). Each incident "
+            f"angle has one exposure for both; at 1 × a perfect diffuser is white. {numbers}",
+        )
     yield _Sketch(
         "ring_effect",
         curves.ring_curves(fine, grid, effect),
@@ -108,14 +110,14 @@ def _of_interpolation(result: RunResult, samples: RawSamples | None) -> Iterator
         fits = fit_lobe_kinds(result.field, grid, fine.incidences[0].index, degrees)
         yield _Sketch(
             "lobe_kinds",
-            curves.lobe_kinds(fine, fits),
+            curves.lobe_kinds(fine, grid, fits),
             "Three lobe kinds",
             f"The original against the paper's representation with each lobe kind at {fine.wavelength.text} (its "
             "figure 10). The paper reports 14.3, 14.3 and 11.5 % at L = 1 and below 4.5 % at L = 4, of its own sample.",
         )
 
 
-def _spectra(result: RunResult) -> _Sketch:
+def _spectra(result: RunResult, field: SpectralField) -> _Sketch:
     grid = result.gridded
     picked = [incidence.index for incidence in pick_incidences(grid)]
     first, last = picked[0], picked[-1]
@@ -124,7 +126,7 @@ def _spectra(result: RunResult) -> _Sketch:
     places = list(dict.fromkeys([(first, 0, 0), (last, mirror, half), (last, 0, 0)]))
     return _Sketch(
         "spectra",
-        curves.spectra(grid, result.field, result.compact, places),
+        curves.spectra(grid, field, result.compact, places),
         "Spectra",
         "Spectra of the grid, of their truncated series, and of the compact form (the paper's figure 11). A Fourier "
         "series starts and ends at the same value, so a spectrum whose ends differ is missed there.",
@@ -188,17 +190,26 @@ def _of_physics_and_solver(result: RunResult) -> Iterator[_Sketch]:
 
 
 def measure_samples(samples: RawSamples, grid: GriddedBRDF) -> list[CutoffSpectrum]:
-    """Measure samples and the residual of their fit against the cut-off of the grid."""
-    residual = None
-    if grid.method == "paper":
-        fitted = dataclasses.replace(grid, window="none")  # eq. (6) is fitted without the window
-        residual = samples.value - evaluate_in_chunks(fitted, samples.theta_i, samples.theta_o, samples.phi_o)
+    """Measure samples and the residual of their fit against the cut-off of the grid, at the wavelengths of both."""
+    live = finite_wavelengths(grid)
+    live = live[np.isfinite(samples.value[:, live]).all(axis=0)]
+    if not live.size:
+        return []
+    value, residual = samples.value[:, live], None
+    if grid.method == "paper":  # eq. (6) is fitted without the window
+        fitted = dataclasses.replace(
+            grid,
+            brdf=np.asarray(grid.brdf)[..., live],
+            wavelength_nm=np.asarray(grid.wavelength_nm)[live],
+            window="none",
+        )
+        residual = value - evaluate_in_chunks(fitted, samples.theta_i, samples.theta_o, samples.phi_o)
     steps = [float(axis[1] - axis[0]) for axis in (grid.theta_o, grid.phi_o)]
     return measure_cutoff(
         samples.theta_i,
         samples.theta_o,
         samples.phi_o,
-        samples.value,
+        value,
         residual=residual,
         theta_i_step=float(grid.theta_i[1] - grid.theta_i[0]) if grid.interpolate_theta_i else 0.0,
         theta_o_step=steps[0],

@@ -30,6 +30,11 @@ def pick_wavelength(wavelength_nm: Float[np.ndarray, " wavelength"], wanted: flo
     return Picked(index, value, text)
 
 
+def finite_wavelengths(gridded: GriddedBRDF) -> np.ndarray:
+    """Indices of the wavelengths that are finite at every node."""
+    return np.flatnonzero(np.isfinite(np.asarray(gridded.brdf)).all(axis=(0, 1, 2)))
+
+
 def pick_incidences(gridded: GriddedBRDF) -> list[Picked]:
     """Return the nodes of theta_i nearest to the paper's 0, 15 and 45 degrees, each once."""
     nodes = np.asarray(gridded.theta_i)
@@ -67,23 +72,25 @@ class FineGrid:
 
 
 def interpolate_finely(gridded: GriddedBRDF, num_theta: int = 181, num_phi: int = 181) -> FineGrid:
-    """Interpolate a grid at the paper's incidences, at one wavelength and in colour.
+    """Interpolate a grid at the paper's incidences, at one wavelength and in colour, from the finite wavelengths.
 
     Interpolation is linear in the node values, so the colours of the interpolated spectra are the interpolated colours
     of the nodes: four channels in place of all wavelengths.
 
     Args:
-        gridded: A grid of method "paper".
+        gridded: A grid of method "paper", finite at one wavelength at least.
         num_theta: Points from 0 to 90 degrees.
         num_phi: Points from 0 to 360 degrees, odd so that 180 is one of them.
 
     Returns:
         The interpolation under the grid's window and under none.
     """
-    wavelength = pick_wavelength(np.asarray(gridded.wavelength_nm))
+    solved = finite_wavelengths(gridded)
+    wavelength_nm = np.asarray(gridded.wavelength_nm)[solved]
+    wavelength = pick_wavelength(wavelength_nm)
     incidences = pick_incidences(gridded)
-    brdf = np.asarray(gridded.brdf)
-    matching = colour.colour_matching(np.asarray(gridded.wavelength_nm))
+    brdf = np.asarray(gridded.brdf)[..., solved]
+    matching = colour.colour_matching(wavelength_nm)
     channels = np.concatenate(
         [brdf[..., wavelength.index : wavelength.index + 1], colour.brdf_to_srgb(brdf, matching, gamma=False)], axis=-1
     )
@@ -95,7 +102,9 @@ def interpolate_finely(gridded: GriddedBRDF, num_theta: int = 181, num_phi: int 
         )
         for window in ("none", gridded.window)
     )
-    return FineGrid(incidences, theta_o, phi_o, wavelength, windowed, plain)
+    return FineGrid(
+        incidences, theta_o, phi_o, wavelength._replace(index=int(solved[wavelength.index])), windowed, plain
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,6 +114,10 @@ class RingEffect:
     nodes: float  # of the straight lines between the nodes: what a field without rings would have
     plain: float  # of eq. (5)
     windowed: float  # of eq. (5) under the window of eq. (17)
+
+    def ratio(self, value: float) -> float:
+        """Return a variation over that of the nodes; 1 where neither varies."""
+        return value / self.nodes if self.nodes > 0 else (1.0 if value == 0 else float("inf"))
 
 
 def total_variation(

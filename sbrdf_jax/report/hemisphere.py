@@ -71,7 +71,7 @@ def color_maps(fine: FineGrid, gridded: GriddedBRDF, effect: RingEffect) -> Any:
     figure.suptitle(title, fontweight="bold")
     figure.supxlabel(
         f"○ incidence, + mirror direction; circles at 30°, 60°, 90°.  Total variation at {fine.incidences[0].text}, "
-        f"nodes = 1:  {effect.plain / effect.nodes:.2f} without, {effect.windowed / effect.nodes:.2f} with window",
+        f"nodes = 1:  {effect.ratio(effect.plain):.2f} without, {effect.ratio(effect.windowed):.2f} with window",
         fontsize=9,
     )
     return figure
@@ -86,7 +86,7 @@ def coverage_maps(gridded: GriddedBRDF) -> Any:
     shown = np.unique(np.linspace(0, len(theta_i) - 1, min(len(theta_i), 14)).round().astype(int))
     columns = min(len(shown), 7)
     rows = -(-len(shown) // columns)
-    figure = new_figure(width=1.35 * columns + 0.6, height=1.55 * rows + 1.0)
+    figure = new_figure(width=max(1.35 * columns + 0.6, 6.5), height=1.55 * rows + 1.0)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     palette = np.array([to_rgb(color) for _, color in COVERAGE])
     for axes in panels:

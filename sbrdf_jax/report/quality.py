@@ -100,11 +100,14 @@ def solver(gridded: GriddedBRDF, tolerance: float | None) -> Any:
     residual = np.asarray(gridded.kkt_residual, float)
     good = np.asarray(gridded.status) == 0
     shown = np.where(residual > 0, residual, np.nan)
-    for chosen, color, marker, label in ((good, BLUE, "o", "reached it"), (~good, VERMILLION, "X", "did not")):
+    good, bad = good & np.isfinite(residual), ~good & np.isfinite(residual)
+    for chosen, color, marker, label in ((good, BLUE, "o", "reached it"), (bad, VERMILLION, "X", "did not")):
         if chosen.any():
             axes.plot(
                 wavelength[chosen], shown[chosen], color=color, marker=marker, markersize=4, linewidth=0, label=label
             )
+    for number, lost in enumerate(wavelength[~np.isfinite(residual)]):
+        axes.axvline(lost, color=VERMILLION, alpha=0.5, linewidth=1.5, label="not finite" if number == 0 else None)
     if tolerance is not None:
         axes.axhline(tolerance, color=ORANGE, linewidth=1.3, label=f"tolerance {tolerance:.0e}")
     axes.set_yscale("log")

@@ -13,19 +13,19 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sbrdf_jax.angles import MIRROR_AZIMUTH, angle_between
-from sbrdf_jax.lobes import LOBE_KINDS, lobe_exponents
+from sbrdf_jax.lobes import lobe_exponents
 from sbrdf_jax.records import Status
 from sbrdf_jax.representation.background import fit_background
 from sbrdf_jax.representation.directions import DirectionSet
 from sbrdf_jax.representation.lobe_fit import Lobe, best_start, fit_lobe, width_bank
-from sbrdf_jax.representation.peak import PlaneOfIncidence, lobe_peaks
 
 CANDIDATES = 21
 FALLEN = 0.05  # of the far median: a coefficient this close to it has no lobe left
 HALVINGS = 36  # after which a lobe is 1e-11 of its height
 ROUNDING = 1e-9  # rad
-PAIR_BATCH = 16
-LANE_BATCH = 64  # arrays of so many lanes stay in the processor's cache
+PAIR_BLOCK = 64  # searched before the next ones, to bound the memory
+PAIR_BATCH = 16  # in one call
+LANE_BATCH = 64  # in one call: arrays of so many lanes stay in the processor's cache
 POLISH_ROUNDS = 10
 
 
@@ -59,7 +59,7 @@ class Lanes(NamedTuple):
     critical_angle: Float[np.ndarray, "pair candidate"]  # rad
     background: Float[np.ndarray, "pair candidate function"]  # of the orthonormal harmonics
     target: Float[np.ndarray, "pair candidate direction"]  # what the background leaves
-    inside: Float[np.ndarray, "pair candidate direction"]  # directions within the critical angle
+    inside: Bool[np.ndarray, "pair candidate direction"]  # directions within the critical angle
     lobe: Lobe  # arrays [pair, candidate, kind]
 
 
@@ -94,7 +94,7 @@ def critical_candidates(pairs: Pairs, num_functions: int) -> Float[np.ndarray, "
     half = _first(above <= above[:, :3].max(axis=1, keepdims=True) / 2)
     fallen = _first(above <= FALLEN * np.abs(far))
     vanished = _first(np.all(exponent >= HALVINGS * np.take_along_axis(exponent, half[:, None], 2), axis=1))
-    most = np.minimum(alpha[:, [-num_functions - 1]], np.pi / 2)
+    most = np.minimum(alpha[:, [max(alpha.shape[1] - num_functions - 1, 0)]], np.pi / 2)
     lower = np.minimum(np.take_along_axis(alpha, np.maximum(half, 2), 1) + ROUNDING, most)
     upper = np.clip(np.take_along_axis(alpha, np.maximum(fallen, vanished), 1), lower, most)
     return np.linspace(lower[:, 0], upper[:, 0], CANDIDATES, axis=1)
@@ -124,7 +124,7 @@ def search_lanes(
 def fit_lanes(
     target: Float[np.ndarray, "pair candidate direction"],
     inside: Bool[np.ndarray, "pair candidate direction"],
-    exponent: Float[np.ndarray, "pair #candidate kind direction"],
+    exponent: Float[np.ndarray, " pair #candidate kind direction"],
     start: tuple[np.ndarray, np.ndarray],
     kinds: LobeKinds,
     weight: Float[np.ndarray, " direction"],
@@ -158,6 +158,15 @@ def fit_lanes(
     return Lobe(*(array.reshape(shape) if only is None else array for array in found))
 
 
+def search(pairs: Pairs, kinds: LobeKinds, functions: np.ndarray, weight: np.ndarray) -> Winners:
+    """Return the best lane of each pair; `search_lanes`, a block of pairs at a time to bound the memory."""
+    blocks = []
+    for start in range(0, len(pairs.value), PAIR_BLOCK):
+        block = Pairs(*(array[start : start + PAIR_BLOCK] for array in pairs))
+        blocks.append(best_lanes(search_lanes(block, kinds, functions, weight), block, kinds, weight))
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
+
+
 def best_lanes(lanes: Lanes, pairs: Pairs, kinds: LobeKinds, weight: Float[np.ndarray, " direction"]) -> Winners:
     """Return the lane of each pair with the least error over all directions.
 
@@ -166,7 +175,7 @@ def best_lanes(lanes: Lanes, pairs: Pairs, kinds: LobeKinds, weight: Float[np.nd
     """
     shape = lanes.lobe.error.shape
     pair = np.arange(shape[0])
-    best = lanes.lobe.error.reshape(shape[0], -1).argmin(axis=1) + pair * (shape[1] * shape[2])
+    best = least(lanes.lobe.error) + pair * (shape[1] * shape[2])
     flat = Lobe(*(array.ravel() for array in lanes.lobe))
     for _ in range(POLISH_ROUNDS):
         slow = best[flat.status[best] == Status.MAX_STEPS]
@@ -183,38 +192,6 @@ def best_lanes(lanes: Lanes, pairs: Pairs, kinds: LobeKinds, weight: Float[np.nd
         np.array(kinds.index)[kind],
         Lobe(*(array[best] for array in flat)),
     )
-
-
-def refine_peaks(
-    mean: Float[np.ndarray, "theta_i direction"],
-    theta_i: Float[np.ndarray, " theta_i"],
-    plane: PlaneOfIncidence,
-    directions: DirectionSet,
-    kinds: LobeKinds,
-    functions: Float[np.ndarray, "direction function"],
-) -> Float[np.ndarray, " theta_i"]:
-    """Return where the lobe of each incident angle points: theta_o of its peak [rad], at the mirror azimuth.
-
-    First by the mean of the spectra, a parabola through its logarithms. Then every candidate
-    background of a search on that mean is taken off, and the peak sought again on the rest: a
-    sloping background displaces the maximum of the sum. The least error wins.
-    """
-    largest = np.abs(mean).max(axis=1, keepdims=True)
-    mean = mean / np.where(largest > 0, largest, 1.0)
-    first = lobe_peaks(plane, mean, theta_i)
-    alpha, exponent = lobe_geometry(first, directions)
-    lanes = search_lanes(Pairs(mean, alpha, exponent[:, kinds.index]), kinds, functions, directions.weight)
-
-    shape = lanes.lobe.height.shape
-    rest, angle = lanes.target.reshape(-1, mean.shape[1]), np.repeat(theta_i, CANDIDATES)
-    moved = np.stack([lobe_peaks(plane, rest, angle, LOBE_KINDS[k]) for k in kinds.index], axis=-1)
-    _, exponent = lobe_geometry(moved.ravel(), directions)
-    exponent = exponent[np.arange(moved.size), np.tile(kinds.index, len(rest))].reshape(*shape, -1)
-    again = fit_lanes(lanes.target, lanes.inside, exponent, lanes.lobe[:2], kinds, directions.weight)
-
-    peaks = np.stack([np.broadcast_to(first[:, None, None], shape), moved.reshape(shape)], axis=1)
-    errors = np.stack([lanes.lobe.error, again.error], axis=1).reshape(len(first), -1)
-    return peaks.reshape(errors.shape)[np.arange(len(first)), errors.argmin(axis=1)]
 
 
 @jax.jit
@@ -235,7 +212,9 @@ def _prepare(value, alpha, exponent, critical_angle, widths, functions, weight):
         outside = alpha > critical_angle
         background = fit_background(value, outside, functions, weight)
         inside_weight = jnp.where(outside, 0.0, weight)
-        start = jax.vmap(best_start, (None, None, 0, 0))(value - functions @ background, inside_weight, exponent, widths)
+        start = jax.vmap(best_start, (None, None, 0, 0))(
+            value - functions @ background, inside_weight, exponent, widths
+        )
         return background, *start
 
     of_pair = jax.vmap(candidate, (None, None, None, 0))
@@ -243,6 +222,11 @@ def _prepare(value, alpha, exponent, critical_angle, widths, functions, weight):
 
 
 _fit_batch = jax.jit(jax.vmap(fit_lobe, in_axes=(0, 0, 0, None, 0, 0)))
+
+
+def least(error: Float[np.ndarray, " pair *choice"]) -> Int[np.ndarray, " pair"]:
+    """Return the place of each pair's least error among its flattened choices; NaN loses to everything."""
+    return np.where(np.isnan(error), np.inf, error).reshape(len(error), -1).argmin(axis=1)
 
 
 def _first(condition):

@@ -1,36 +1,36 @@
 """Height and width of lobes by Levenberg-Marquardt, from the best of a bank of widths (section 4.2)."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from sbrdf_jax.records import Status
 
 BANK_SIZE = 48
 WIDEST = 30.0  # beyond it no grid tells a lobe from a constant and a slope
 NARROWEST_DROP = 1000.0  # the narrowest lobe falls by this factor within one step of the grid
-MAX_STEPS = 20
+MAX_STEPS = 12
 TOLERANCE = 1e-5  # of the largest target; a fit without a misfit converges quadratically, far below it
 # Levenberg-Marquardt starts with damping 1: too much beside an optimum for residuals of size 1,
 # while 1e4 would take a dozen rejected steps before damping is felt at all.
 RESIDUAL_SCALE = 1e3
-STATIONARY = 1e-3  # cosine of residual and Jacobian: a step could lower the squared error by a millionth
-NOISE_LEVEL = 1e-9  # of the largest target; a residual below it has no direction
+STATIONARY = 1e-6  # share of the squared error that one more step may promise
+NOISE_POWER = 0.6  # a residual below epsilon to this power (4e-10 in float64), of the largest target, is noise
 
 
 class Lobe(NamedTuple):
-    """One fitted lobe, or many in arrays of equal shape."""
+    """One fitted lobe, or many in arrays of equal shape; JAX or NumPy."""
 
-    height: Float[Array, "*shape"]
-    width: Float[Array, "*shape"]
-    status: Int[Array, "*shape"]  # Status
-    num_steps: Int[Array, "*shape"]
-    error: Float[Array, "*shape"]  # weighted sum of squares over all directions
+    height: Any
+    width: Any
+    status: Any  # Status
+    num_steps: Any
+    error: Any  # weighted sum of squares over all directions
 
 
 def width_bank(exponent_of_step: float) -> Float[np.ndarray, " width"]:
@@ -87,7 +87,7 @@ def fit_lobe(
 
     Returns:
         The lobe, no worse than its start. Status CLAMPED where the width is the least one,
-        MAX_STEPS where the residual is not yet orthogonal to the Jacobian, NONFINITE.
+        MAX_STEPS where one more step promises a lower error, NONFINITE.
 
     Numerics:
         The unknowns are the height, of any sign, and the logarithm of the width, clipped. What
@@ -116,18 +116,26 @@ def fit_lobe(
 
 
 def _certify(residual, height, log_width, narrowest, widest):
-    """Return the status of a lane from its gradient: the residual is orthogonal to both columns, or is nothing."""
-    left, by_height = jax.jvp(lambda x: residual((x, log_width), None), (height,), (jnp.ones_like(height),))
-    by_width = jax.jvp(lambda x: residual((height, x), None), (log_width,), (jnp.ones_like(height),))[1]
-    size = STATIONARY * jnp.sqrt(jnp.sum(left**2)) + RESIDUAL_SCALE * NOISE_LEVEL
+    """Return the status of a lane: how much of its squared error would one Gauss-Newton step take off?"""
+    one = jnp.ones_like(height)
+    left, by_height = jax.jvp(lambda x: residual((x, log_width), None), (height,), (one,))
+    by_width = jax.jvp(lambda x: residual((height, x), None), (log_width,), (one,))[1]
+    squared = jnp.sum(left**2)
+    eps = jnp.finfo(squared.dtype).eps
 
-    def is_orthogonal(column):
-        return jnp.abs(column @ left) <= jnp.sqrt(jnp.sum(column**2)) * size
-
+    # the part of `left` along both columns, by Gram-Schmidt; at an edge the width has no say
     is_narrowest = log_width <= narrowest
-    is_done = is_orthogonal(by_height) & (is_orthogonal(by_width) | is_narrowest | (log_width >= widest))
+    along_height = _share(by_height, left)
+    by_width = by_width - by_height * (by_height @ by_width) / jnp.maximum(jnp.sum(by_height**2), eps)
+    along_width = jnp.where(is_narrowest | (log_width >= widest), 0.0, _share(by_width, left))
+    noise = (RESIDUAL_SCALE * eps**NOISE_POWER) ** 2
+    is_done = along_height + along_width <= STATIONARY * squared + noise
     status = jnp.where(is_done, int(Status.OK), int(Status.MAX_STEPS))
     status = jnp.where(is_done & is_narrowest, int(Status.CLAMPED), status)
-    return jnp.where(jnp.isfinite(jnp.sum(left**2)), status, int(Status.NONFINITE))
+    return jnp.where(jnp.isfinite(squared), status, int(Status.NONFINITE))
 
 
+def _share(column, vector):
+    """Return the squared length of a vector's part along a column."""
+    squared = jnp.sum(column**2)
+    return (column @ vector) ** 2 / jnp.where(squared > 0, squared, 1.0)

@@ -19,18 +19,17 @@ from sbrdf_jax.options import RepresentOptions
 from sbrdf_jax.records import CompactBRDF, SpectralField, Status
 from sbrdf_jax.representation.background import orthonormal_harmonics
 from sbrdf_jax.representation.directions import distinct_directions, is_bilateral
-from sbrdf_jax.representation.peak import plane_of_incidence
 
 DEFAULT_MAX_DEGREE = 4
-ENOUGH = 0.01  # of a lane's energy: an error, or a gain, below it needs no lobe
-LANE_REASONS = ("searched", "background_suffices", "zero_everywhere", "nonfinite")
+ENOUGH = 0.01  # relative error of a lane: what the background leaves, or a lobe takes off it, that calls for a lobe
+LANE_REASONS = ("searched", "background_suffices", "zero_everywhere", "nonfinite")  # 0, 1, 2, 3
 
 
 def compact_coefficient(
     compact: CompactBRDF,
-    i_theta: Int[Array, "*shape"] | int,
-    theta_o: Float[Array, "*shape"],
-    phi_o: Float[Array, "*shape"],
+    i_theta: Int[Array | np.ndarray, "..."] | int,
+    theta_o: Float[Array | np.ndarray, "*shape"],
+    phi_o: Float[Array | np.ndarray, "*shape"],
 ) -> Float[Array, "*shape coefficient"]:
     """Evaluate eq. (13) at directions, at nodes of the incident angle; pure, for jit, vmap and grad.
 
@@ -52,12 +51,7 @@ def compact_coefficient(
     return smooth + lobe_value_any(alpha, *lobe)
 
 
-def represent(field: SpectralField, options: RepresentOptions) -> CompactBRDF:
-    """Return the paper's compact form of a field; `represent_with_plan` without its plan."""
-    return represent_with_plan(field, options)[0]
-
-
-def represent_with_plan(field: SpectralField, options: RepresentOptions) -> tuple[CompactBRDF, dict[str, Any]]:
+def represent(field: SpectralField, options: RepresentOptions) -> tuple[CompactBRDF, dict[str, Any]]:
     """Return the paper's compact form of a field, and what was computed and what was skipped.
 
     Args:
@@ -69,13 +63,14 @@ def represent_with_plan(field: SpectralField, options: RepresentOptions) -> tupl
         `reason_names`, and `num_lobe_fits`, candidates and kinds included.
 
     Numerics:
-        Eq. (18) counts every node, so a direction weighs as many nodes as it has. A lane is
-        "no lobe" where its background leaves less than 1 % of its energy, or the lobe takes
-        off less. A lane with a value that is not finite has a background of NaN and the status
-        NONFINITE; the others do not notice.
+        Eq. (18) counts every node, so a direction weighs as many nodes as it has. A lane has
+        no lobe where its background alone leaves a relative error (eq. 18 for this lane) below
+        1 %, or where a lobe would lower that error by less than 1 %. A lane with a value that
+        is not finite has a background of NaN and the status NONFINITE; the others do not notice.
     """
     # here, because its solver takes a second to import: not for those who only evaluate
     from sbrdf_jax.representation import lane_search
+    from sbrdf_jax.representation.peak import plane_of_incidence, refine_peaks
 
     theta_i, theta_o, phi_o = (np.asarray(axis, np.float64) for axis in (field.theta_i, field.theta_o, field.phi_o))
     max_degree = DEFAULT_MAX_DEGREE if options.max_degree == "auto" else options.max_degree
@@ -86,46 +81,37 @@ def represent_with_plan(field: SpectralField, options: RepresentOptions) -> tupl
     directions = distinct_directions(theta_o, phi_o, folded=is_bilateral(node_value, phi_o))
     harmonics = orthonormal_harmonics(directions, max_degree)
     functions, weight = harmonics.value, directions.weight
+    value, scale = _scaled_lanes(directions.merge(node_value))
 
-    value = np.moveaxis(directions.merge(node_value), 1, 2)  # [theta_i, coefficient, direction]
-    is_finite = np.isfinite(value).all(axis=2)
-    value = np.where(is_finite[..., None], value, 0.0)
-    scale = np.abs(value).max(axis=2)
-    scale = np.where(scale > 0, scale, 1.0)
-    value = value / scale[..., None]
+    known = value * np.nan_to_num(scale)[..., None]
+    mean = np.asarray(mean_spectrum(np.moveaxis(known, 1, 2), field.basis))
+    plane = plane_of_incidence(theta_o, phi_o, directions)
+    peak = refine_peaks(mean, theta_i, plane, directions, kinds, functions)
 
+    # the background alone, for every lane: from here on a lane is only ever improved
     background = (value * weight) @ functions
     energy, error = value**2 @ weight, (value - background @ functions.T) ** 2 @ weight
-    reason = np.where(error < ENOUGH**2 * energy, 1, 0)
-    reason = np.where(energy > 0, reason, 2)
-    reason = np.where(is_finite, reason, 3)
+    reason = np.select([np.isnan(scale), energy == 0, error < ENOUGH**2 * energy], [3, 2, 1], 0)
+    kind, height, width = np.zeros(scale.shape, int), np.zeros(scale.shape), np.ones(scale.shape)
+    critical_angle = np.full(scale.shape, np.nan)
+    status = np.where(np.isnan(scale), int(Status.NONFINITE), int(Status.NO_LOBE))
 
-    mean = mean_spectrum(np.moveaxis(value * scale[..., None], 1, 2), field.basis)
-    plane = plane_of_incidence(theta_o, phi_o, directions)
-    peak = lane_search.refine_peaks(mean, theta_i, plane, directions, kinds, functions)
-
-    kind = np.zeros(reason.shape, int)
-    height, width = np.zeros(reason.shape), np.ones(reason.shape)
-    critical_angle = np.full(reason.shape, np.nan)
-    status = np.where(is_finite, int(Status.NO_LOBE), int(Status.NONFINITE))
-    i, k = np.nonzero(reason == 0)
-    if i.size:
+    lane = np.nonzero(reason == 0)
+    if lane[0].size:
         alpha, exponent = lane_search.lobe_geometry(peak, directions)
-        pairs = lane_search.Pairs(value[i, k], alpha[i], exponent[i][:, kinds.index])
-        lanes = lane_search.search_lanes(pairs, kinds, functions, weight)
-        best = lane_search.best_lanes(lanes, pairs, kinds, weight)
-        gains = np.sqrt(error[i, k]) - np.sqrt(best.lobe.error) >= ENOUGH * np.sqrt(energy[i, k])
-        i, k = i[gains], k[gains]
-        background[i, k] = best.background[gains]
-        kind[i, k], critical_angle[i, k] = best.kind[gains], best.critical_angle[gains]
-        height[i, k], width[i, k] = best.lobe.height[gains] * scale[i, k], best.lobe.width[gains]
-        status[i, k] = best.lobe.status[gains]
-    background = (background * scale[..., None]) @ harmonics.to_harmonics.T
-    background[~is_finite] = np.nan
+        pairs = lane_search.Pairs(value[lane], alpha[lane[0]], exponent[lane[0]][:, kinds.index])
+        best = lane_search.search(pairs, kinds, functions, weight)
+        gain = np.sqrt(error[lane]) - np.sqrt(best.lobe.error)
+        gains = gain >= ENOUGH * np.sqrt(energy[lane])
+        lane = (lane[0][gains], lane[1][gains])
+        background[lane], critical_angle[lane] = best.background[gains], best.critical_angle[gains]
+        kind[lane], height[lane] = best.kind[gains], best.lobe.height[gains] * scale[lane]
+        width[lane], status[lane] = best.lobe.width[gains], best.lobe.status[gains]
+
     compact = CompactBRDF(
         theta_i,
         field.basis,
-        background,
+        (background * scale[..., None]) @ harmonics.to_harmonics.T,
         kind,
         height,
         width,
@@ -137,3 +123,16 @@ def represent_with_plan(field: SpectralField, options: RepresentOptions) -> tupl
     )
     num_fits = int((reason == 0).sum()) * lane_search.CANDIDATES * len(kinds.index)
     return compact, {"lane_reason": reason, "reason_names": LANE_REASONS, "num_lobe_fits": num_fits}
+
+
+def _scaled_lanes(value):
+    """Return lanes [theta_i, coefficient, direction] whose largest value is 1, and what they were divided by.
+
+    A lane with a value that is not finite is 0, and its scale NaN.
+    """
+    value = np.moveaxis(value, 1, 2)
+    is_finite = np.isfinite(value).all(axis=2)
+    value = np.where(is_finite[..., None], value, 0.0)
+    largest = np.abs(value).max(axis=2)
+    scale = np.where(largest > 0, largest, 1.0)
+    return value / scale[..., None], np.where(is_finite, scale, np.nan)

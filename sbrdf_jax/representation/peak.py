@@ -6,7 +6,17 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sbrdf_jax.angles import MIRROR_AZIMUTH, fold_azimuth
+from sbrdf_jax.lobes import LOBE_KINDS
 from sbrdf_jax.representation.directions import SAME_ANGLE, DirectionSet
+from sbrdf_jax.representation.lane_search import (
+    CANDIDATES,
+    LobeKinds,
+    Pairs,
+    fit_lanes,
+    least,
+    lobe_geometry,
+    search_lanes,
+)
 
 BISECTIONS = 52
 ROUNDING = 1e-6  # rad, by which a bracket is widened: a peak may lie half-way between two nodes
@@ -76,3 +86,35 @@ def lobe_peaks(
         lower, upper = np.where(is_left, middle, lower), np.where(is_left, upper, middle)
     peak = np.clip(np.where(is_bracket, (lower + upper) / 2, signed[top]), 0, np.pi / 2)
     return np.where((theta_i < SAME_ANGLE) | ~(ahead[lane, top] > 0), theta_i, peak)
+
+
+def refine_peaks(
+    mean: Float[np.ndarray, "theta_i direction"],
+    theta_i: Float[np.ndarray, " theta_i"],
+    plane: PlaneOfIncidence,
+    directions: DirectionSet,
+    kinds: LobeKinds,
+    functions: Float[np.ndarray, "direction function"],
+) -> Float[np.ndarray, " theta_i"]:
+    """Return where the lobe of each incident angle points: theta_o of its peak [rad], at the mirror azimuth.
+
+    First by the mean of the spectra, a parabola through its logarithms. Then every candidate
+    background of a search on that mean is taken off, and the peak sought again on the rest: a
+    sloping background displaces the maximum of the sum. The least error wins.
+    """
+    largest = np.abs(mean).max(axis=1, keepdims=True)
+    mean = mean / np.where(largest > 0, largest, 1.0)
+    first = lobe_peaks(plane, mean, theta_i)
+    alpha, exponent = lobe_geometry(first, directions)
+    lanes = search_lanes(Pairs(mean, alpha, exponent[:, kinds.index]), kinds, functions, directions.weight)
+
+    shape = lanes.lobe.height.shape
+    rest, angle = lanes.target.reshape(-1, mean.shape[1]), np.repeat(theta_i, CANDIDATES)
+    moved = np.stack([lobe_peaks(plane, rest, angle, LOBE_KINDS[k]) for k in kinds.index], axis=-1)
+    _, exponent = lobe_geometry(moved.ravel(), directions)
+    exponent = exponent[np.arange(moved.size), np.tile(kinds.index, len(rest))].reshape(*shape, -1)
+    again = fit_lanes(lanes.target, lanes.inside, exponent, lanes.lobe[:2], kinds, directions.weight)
+
+    peaks = np.stack([np.broadcast_to(first[:, None, None], shape), moved.reshape(shape)], axis=1)
+    best = least(np.stack([lanes.lobe.error, again.error], axis=1))
+    return peaks.reshape(len(first), -1)[np.arange(len(first)), best]
