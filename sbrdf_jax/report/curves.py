@@ -9,7 +9,7 @@ from sbrdf_jax.encoding import decode
 from sbrdf_jax.evaluation import evaluate_in_chunks
 from sbrdf_jax.metrics import CHUNK_SIZE
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, RawSamples, SpectralField
-from sbrdf_jax.report.fine_grid import FineGrid, RingEffect, has_no_data, pick_wavelength
+from sbrdf_jax.report.fine_grid import FineGrid, RingEffect, pick_wavelength
 from sbrdf_jax.report.lobe_fits import KindFit
 from sbrdf_jax.report.style import BLUE, INK, LINES, MUTED, SERIES, VERMILLION, new_figure, plane_axis
 
@@ -28,7 +28,7 @@ def plane_of_incidence(fine: FineGrid, gridded: GriddedBRDF, samples: RawSamples
     num_shown = 0
     for k, (incidence, color, line) in enumerate(zip(fine.incidences, SERIES, LINES, strict=False)):
         angle, value = fine.plane(fine.windowed, k)
-        label = f"$\\theta_i$ = {incidence.text}" + (", no data" if has_no_data(gridded, incidence.index) else "")
+        label = f"$\\theta_i$ = {incidence.text}"
         axes.plot(np.degrees(angle), value, color=color, linestyle=line, label=label, zorder=3)
         nodes, at_nodes = nodes_in_plane(gridded, incidence.index, fine.wavelength.index)
         axes.plot(nodes, at_nodes, color=color, marker="o", markersize=3.4, linewidth=0, zorder=4)

@@ -173,7 +173,7 @@ def _of_samples(result: RunResult, samples: RawSamples | None) -> Iterator[_Sket
 
 
 def _of_physics_and_solver(result: RunResult) -> Iterator[_Sketch]:
-    if "albedo" in result.metrics:
+    if np.isfinite(result.metrics.get("albedo", np.nan)).any():
         absolute = result.input.get("quantity", "brdf") == "brdf"
         yield _Sketch(
             "albedo",

@@ -44,6 +44,7 @@ def pick_incidences(gridded: GriddedBRDF) -> list[Picked]:
         if index not in picked:
             is_exact = abs(nodes[index] - wanted) < np.radians(0.01)
             text = f"{np.degrees(nodes[index]):.4g}°" + ("" if is_exact else f" (for {np.degrees(wanted):.4g}°)")
+            text += ", no data" if has_no_data(gridded, index) else ""
             picked[index] = Picked(index, float(nodes[index]), text)
     return list(picked.values())
 

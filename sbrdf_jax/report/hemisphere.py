@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sbrdf_jax.records import GriddedBRDF
-from sbrdf_jax.report.fine_grid import FineGrid, RingEffect, has_no_data
+from sbrdf_jax.report.fine_grid import FineGrid, RingEffect
 from sbrdf_jax.report.style import BLUE, MUTED, ORANGE, SKY, hemisphere_axes, new_figure
 
 PIXELS = 361
@@ -61,8 +61,7 @@ def color_maps(fine: FineGrid, gridded: GriddedBRDF, effect: RingEffect) -> Any:
             opaque = np.concatenate([encode_srgb(np.where(outside, 1.0, image)), 1.0 - outside], axis=-1)
             axes.imshow(opaque, extent=(-90, 90, -90, 90), origin="lower", interpolation="bilinear")
             hemisphere_axes(axes, incidence.value)
-        no_data = ", no data" if has_no_data(gridded, incidence.index) else ""
-        panels[0, k].set_title(f"$\\theta_i$ = {incidence.text}{no_data}", loc="center")
+        panels[0, k].set_title(f"$\\theta_i$ = {incidence.text}", loc="center")
         panels[1, k].text(0, -104, f"exposure {1 / white:.2g} ×", ha="center", va="top", fontsize=8.5, color=MUTED)
     window = {"none": "window: none (as above)"}.get(gridded.window, f"window: {gridded.window}")
     for axes, text in zip(panels[:, 0], ("no window", window), strict=True):

@@ -78,13 +78,15 @@ def albedo(gridded: GriddedBRDF, value: np.ndarray, *, absolute: bool) -> Any:
     axes = figure.subplots()
     theta_i, wavelength = np.degrees(gridded.theta_i), np.asarray(gridded.wavelength_nm)
     picked = dict.fromkeys(pick_wavelength(wavelength, wanted).index for wanted in (450.0, 550.0, 650.0))
-    axes.fill_between(theta_i, value.min(axis=1), value.max(axis=1), color=FAINT, linewidth=0, label="all wavelengths")
+    low, high = np.nanmin(value, axis=1), np.nanmax(value, axis=1)
+    axes.fill_between(theta_i, low, high, color=SKY, alpha=0.25, linewidth=0, label="all wavelengths")
     for index, color, line in zip(picked, (BLUE, GREEN, VERMILLION), LINES, strict=False):
         label = f"{wavelength[index]:g} nm"
         axes.plot(theta_i, value[:, index], color=color, linestyle=line, marker="o", markersize=3.5, label=label)
-    if absolute and value.max() > 0.8:
+    if absolute and np.nanmax(value) > 0.8:
         axes.axhline(1.0, color=PURPLE, linewidth=1.3, label="1: all is reflected")
     axes.set_ylim(bottom=0)
+    shade_without_data(axes, gridded)
     incidence_axis(axes, theta_i)
     axes.set_ylabel("albedo" if absolute else "albedo [relative]")
     axes.set_title("Directional-hemispherical reflectance of the grid")
@@ -130,7 +132,7 @@ def cleaning(counts: Sequence[tuple[str, str, int]], num_read: int) -> Any:
     """What cleaning did: a bar for each reason, coloured by what was done.
 
     Args:
-        counts: (what was done, reason, number of samples), zeros left out.
+        counts: (what was done, flag, number of samples), zeros left out.
         num_read: Samples in the file.
 
     Returns:
@@ -142,7 +144,9 @@ def cleaning(counts: Sequence[tuple[str, str, int]], num_read: int) -> Any:
     for row, (done, _, number) in enumerate(reversed(counts)):
         axes.barh(row, number, color=colors.get(done, MUTED), height=0.65)
         axes.text(number, row, f"  {number:,} ({100 * number / max(num_read, 1):.2g} %)", va="center", fontsize=9)
-    axes.set_yticks(range(len(counts)), [f"{done}: {reason}" for done, reason, _ in reversed(counts)])
+    axes.set_yticks(
+        range(len(counts)), [done if name == done else f"{done}: {name}" for done, name, _ in reversed(counts)]
+    )
     axes.set_xlabel(f"samples, of {num_read:,} read")
     axes.margins(x=0.18)
     axes.set_ylim(-0.7, max(len(counts), 2) - 0.3)
