@@ -59,7 +59,8 @@ def lobe_value(
     """
     if kind not in LOBE_KINDS:
         raise ValueError(f"lobe kind {kind!r}: expected one of {', '.join(LOBE_KINDS)}")
-    return height * jnp.exp(-lobe_exponents(alpha)[LOBE_KINDS.index(kind)] / width)
+    exponent = lobe_exponents(alpha)[LOBE_KINDS.index(kind)]
+    return jnp.asarray(height * jnp.exp(-exponent / width))
 
 
 def lobe_value_any(

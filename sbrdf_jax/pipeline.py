@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -19,6 +18,7 @@ from sbrdf_jax.representation import represent_with_plan
 from sbrdf_jax.resampling import resample
 from sbrdf_jax.runtime import compile_clock
 from sbrdf_jax.store import RunResult
+from sbrdf_jax.summary import count_statuses
 
 FAILED = (Status.MAX_STEPS, Status.NONFINITE)
 
@@ -125,12 +125,6 @@ def finite_part(gridded: GriddedBRDF) -> GriddedBRDF:
     per_wavelength = ("wavelength_nm", "kkt_residual", "num_steps", "status")
     parts = {name: np.asarray(getattr(gridded, name))[live] for name in per_wavelength}
     return dataclasses.replace(gridded, brdf=np.asarray(gridded.brdf)[..., live], **parts)
-
-
-def count_statuses(status) -> str:
-    """Count lanes by how they ended: "212 ok, 35 no_lobe"."""
-    counts = Counter(Status(int(value)).name.lower() for value in np.ravel(np.asarray(status)))
-    return ", ".join(f"{count} {name}" for name, count in counts.most_common())
 
 
 def failed_lanes(result: RunResult) -> list[str]:

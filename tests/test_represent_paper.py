@@ -17,7 +17,7 @@ from sbrdf_jax.options import RepresentOptions
 from sbrdf_jax.records import CompactBRDF, SpectralField, Status
 from sbrdf_jax.representation import lane_search, represent, represent_with_plan
 from sbrdf_jax.representation.background import orthonormal_harmonics
-from sbrdf_jax.representation.directions import distinct_directions, is_bilateral
+from sbrdf_jax.representation.directions import distinct_directions
 from sbrdf_jax.representation.paper import LANE_REASONS, compact_coefficient
 from sbrdf_jax.representation.peak import lobe_peaks, plane_of_incidence
 
@@ -85,7 +85,6 @@ def test_a_field_made_of_the_models_own_parts_comes_back(kind, rng):
 
 def test_without_mirror_symmetry_all_harmonics_take_part(rng):
     field, made_of = planted(rng, 1, bilateral=False, coefficients=1)
-    assert not is_bilateral(field.coefficient, PHI_O)
     found = represent(field, dataclasses.replace(PAPER, lobe="angle_squared"))
     error = np.abs(at_nodes(found) - field.coefficient).max() / np.abs(field.coefficient).max()
     assert error < BACK
@@ -115,24 +114,27 @@ def test_the_papers_case_is_below_its_error_for_each_kind_and_compiles_once():
 
 def test_background_equals_lstsq_on_the_raw_harmonics_of_all_nodes():
     field, _ = amber()
-    directions = distinct_directions(THETA_O, PHI_O, folded=True)
+    directions = distinct_directions(THETA_O, PHI_O)
     assert directions.weight.sum() == 13 * 49 and len(directions.weight) == 12 * 25 + 1
     harmonics = orthonormal_harmonics(directions, L)
     theta, phi = np.meshgrid(THETA_O, PHI_O, indexing="ij")
     raw = np.asarray(real_harmonics(theta, phi, L)).reshape(-1, len(EVEN))[:, EVEN]
     peak, i = np.array([0.0, 0.27, 0.8, 1.5]), np.arange(4)
     alpha, exponent = lane_search.lobe_geometry(peak, directions)
-    value = directions.merge(field.coefficient)[:, :, 0]
+    value = directions.split(field.coefficient)[0][:, 0]
     kinds = lane_search.lobe_kinds((1,), THETA_O[1])
-    pairs = lane_search.Pairs(value / value.max(axis=1, keepdims=True), alpha, exponent[:, kinds.index])
-    lanes = lane_search.search_lanes(pairs, kinds, harmonics.value, directions.weight)
+    pairs = lane_search.Pairs(
+        value / value.max(axis=1, keepdims=True), np.zeros_like(value), alpha, exponent[:, kinds.index]
+    )
+    functions = lane_search.Functions(harmonics.value, np.zeros((len(value.T), 0)), directions.weight)
+    lanes = lane_search.search_lanes(pairs, kinds, functions)
     for lane in i:
         for candidate in (0, 8):
             outside = (alpha[lane] > lanes.critical_angle[lane, candidate])[directions.index].ravel()
             expected, *_ = np.linalg.lstsq(
                 raw[outside], pairs.value[lane][directions.index].ravel()[outside], rcond=1e-12
             )
-            found = harmonics.to_harmonics @ lanes.background[lane, candidate]
+            found = harmonics.to_harmonics @ lanes.even[lane, candidate]
             scale = np.abs(expected).max()
             np.testing.assert_allclose(found[EVEN], expected, atol=1e-6 * scale)
             np.testing.assert_allclose(found[~EVEN], 0)
@@ -141,13 +143,16 @@ def test_background_equals_lstsq_on_the_raw_harmonics_of_all_nodes():
 
 def test_stationary_lobes_are_no_worse_than_scipys_from_many_starts(rng):
     field, _ = amber("amber_glass_sharp")
-    directions = distinct_directions(THETA_O, PHI_O, folded=True)
+    directions = distinct_directions(THETA_O, PHI_O)
     harmonics = orthonormal_harmonics(directions, L)
     kinds = lane_search.lobe_kinds((1, 2, 3), THETA_O[1])
     alpha, exponent = lane_search.lobe_geometry(np.array([0.0, 0.27, 0.8, 1.5]), directions)
-    value = directions.merge(field.coefficient)[:, :, 0]
-    pairs = lane_search.Pairs(value / value.max(axis=1, keepdims=True), alpha, exponent[:, kinds.index])
-    lanes = lane_search.search_lanes(pairs, kinds, harmonics.value, directions.weight)
+    value = directions.split(field.coefficient)[0][:, 0]
+    pairs = lane_search.Pairs(
+        value / value.max(axis=1, keepdims=True), np.zeros_like(value), alpha, exponent[:, kinds.index]
+    )
+    functions = lane_search.Functions(harmonics.value, np.zeros((len(value.T), 0)), directions.weight)
+    lanes = lane_search.search_lanes(pairs, kinds, functions)
     best = lane_search.best_lanes(lanes, pairs, kinds, directions.weight)
     np.testing.assert_array_equal(best.lobe.status, Status.OK)
     assert np.all(best.lobe.error <= np.min(lanes.lobe.error, axis=(1, 2)) * (1 + 1e-4))  # over all directions
@@ -204,7 +209,7 @@ def test_hard_lanes_end_sensibly_beside_good_ones(rng):
 
 
 def test_peaks_in_the_plane_of_incidence():
-    directions = distinct_directions(THETA_O, PHI_O, folded=True)
+    directions = distinct_directions(THETA_O, PHI_O)
     plane = plane_of_incidence(THETA_O, PHI_O, directions)
     theta_i = np.radians([0.0, 30.0, 30.0, 30.0, 30.0, 89.0])
     peak = np.radians([0.0, 33.0, 0.0, 30.0, 90.0, 88.0])
@@ -237,7 +242,7 @@ def test_evaluation_equals_its_twin_and_has_finite_gradients(rng):
         expected = compact.background[i] @ harmonic + np.where([True, True, alpha < np.pi / 2], lobe, 0)
         np.testing.assert_allclose(found[j], expected, atol=1e-11)
 
-    alone = jax.vmap(compact_coefficient, (None, 0, 0, 0))(compact, node, theta, phi)
+    alone = jax.jit(jax.vmap(compact_coefficient, (None, 0, 0, 0)))(compact, node, theta, phi)
     np.testing.assert_allclose(alone, found, atol=1e-13)
     for where in (compact.lobe_peak_theta_o, np.zeros(4), np.full(4, np.pi / 2)):  # the peak, the pole, the horizon
         assert all(np.isfinite(a).all() for a in slopes(compact, np.arange(4), where, np.full(4, np.pi)))
@@ -247,6 +252,20 @@ def test_a_method_that_is_not_built_is_refused(rng):
     field, _ = planted(rng, 1)
     with pytest.raises(UserError, match="represent.method: found 'lobe_tensor', which is not available yet"):
         represent(field, RepresentOptions(method="lobe_tensor"))
+
+
+def test_the_two_parts_of_a_field_weigh_as_its_nodes(rng):
+    directions = distinct_directions(THETA_O, PHI_O)
+    value = rng.normal(size=(2, 13, 49, 3))
+    value[:, 0] = value[:, 0, :1]
+    value[:, :, -1] = value[:, :, 0]
+    even, odd = directions.split(value)
+    nodes = even[:, :, directions.index] + directions.side * odd[:, :, directions.index]
+    np.testing.assert_allclose(np.moveaxis(nodes, 1, -1), value, atol=1e-12)
+    np.testing.assert_allclose((even**2 + odd**2) @ directions.weight, np.sum(value**2, axis=(1, 2)), rtol=1e-12)
+    assert not directions.split(value + value[:, :, ::-1])[1].any()
+    with pytest.raises(ValueError, match="symmetric"):
+        distinct_directions(THETA_O, PHI_O[:20])
 
 
 def test_a_coarse_grid_still_has_an_answer():

@@ -202,8 +202,17 @@ def test_no_positive_value_is_refused(folder, tmp_path, capsys):
 def test_a_stopped_run_leaves_nothing_under_the_output_name(folder, tmp_path, sent, code):
     words = ["-m", "sbrdf_jax.run", str(folder / "config.yaml"), "grid.theta_i_step_deg=7.5", "output.path=x.h5"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
+
+    def heed_interrupts() -> None:  # a background shell passes on that SIGINT is ignored
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
     process = subprocess.Popen(
-        [sys.executable, *words], cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=environment
+        [sys.executable, *words],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        preexec_fn=heed_interrupts,
     )
     deadline = time.monotonic() + 120
     while not (tmp_path / "x.h5.log").exists() and time.monotonic() < deadline:

@@ -25,19 +25,24 @@ class OrthonormalHarmonics(NamedTuple):
     to_harmonics: Float[np.ndarray, "harmonic function"]  # A of eq. (13) = to_harmonics @ coefficients
 
 
-def orthonormal_harmonics(directions: DirectionSet, max_degree: int) -> OrthonormalHarmonics:
+def orthonormal_harmonics(directions: DirectionSet, max_degree: int, *, even: bool = True) -> OrthonormalHarmonics:
     """Return the orthonormal combinations of the harmonics up to L, on the host in float64.
 
-    Where mirror twins are one direction, only the harmonics that are even in phi_o take part:
-    the coefficients of the odd ones are 0. Combinations that the directions cannot tell from 0
-    are 0, so their coefficients are too.
+    Args:
+        directions: Where, and how often each counts.
+        max_degree: L.
+        even: Of the harmonics that are even in phi_o (m >= 0), else of the odd ones.
+
+    Returns:
+        Combinations; those that the directions cannot tell from 0 are 0, and so is what they
+        give to the coefficients of the harmonics.
     """
     orders = harmonic_orders(max_degree)
-    used = np.array([m >= 0 or not directions.folded for _, m in orders])
+    used = np.array([(m >= 0) == even for _, m in orders])
     harmonic = np.asarray(real_harmonics(directions.theta_o, directions.phi_o, max_degree), np.float64)
     root_weight = np.sqrt(directions.weight)[:, None]
     left, singular, right = np.linalg.svd(root_weight * harmonic[:, used], full_matrices=False)
-    keep = singular > singular[0] * max(left.shape) * np.finfo(np.float64).eps
+    keep = singular > singular.max(initial=0.0) * max(left.shape) * np.finfo(np.float64).eps
     to_harmonics = np.zeros((len(orders), len(singular)))
     to_harmonics[used] = np.where(keep, right.T / np.where(keep, singular, 1), 0)
     return OrthonormalHarmonics(np.where(keep, left / root_weight, 0), to_harmonics)

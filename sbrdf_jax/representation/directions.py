@@ -1,4 +1,9 @@
-"""The distinct directions of a grid, and how often each one counts."""
+"""The distinct directions of a grid up to mirror symmetry, and how often each one counts.
+
+The lobe's peak lies in the plane of incidence, so every critical angle keeps mirror twins
+together and least squares falls apart into two: the part of a field that is even in phi_o,
+with the even harmonics and the lobe, and the odd part, with the odd harmonics.
+"""
 
 from typing import NamedTuple
 
@@ -15,38 +20,44 @@ class DirectionSet(NamedTuple):
     """The distinct directions of the inclusive grid; eq. (18) counts each as often as it has nodes."""
 
     theta_o: Float[np.ndarray, " direction"]  # rad
-    phi_o: Float[np.ndarray, " direction"]  # rad, 0 to pi where mirror twins are one direction
-    weight: Float[np.ndarray, " direction"]  # nodes of the direction
+    phi_o: Float[np.ndarray, " direction"]  # rad, 0 to pi
+    weight: Float[np.ndarray, " direction"]  # nodes of the direction and of its mirror twin
     index: Int[np.ndarray, "theta_o phi_o"]  # direction of each node
-    folded: bool  # mirror twins are one direction
+    side: Float[np.ndarray, "theta_o phi_o"]  # of each node: 1, or -1 beyond pi, or 0 in the plane of incidence
 
-    def merge(self, value: Float[np.ndarray, "theta_i theta_o phi_o coefficient"]) -> np.ndarray:
-        """Return the mean over the nodes of each direction, [theta_i, direction, coefficient]."""
-        nodes = value.reshape(len(value), -1, value.shape[-1])
-        share = np.zeros((len(self.weight), self.index.size))
-        share[self.index.ravel(), np.arange(self.index.size)] = 1 / self.weight[self.index.ravel()]
-        return share @ nodes
+    def split(self, value: Float[np.ndarray, "theta_i theta_o phi_o coefficient"]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the even and the odd part of values at the nodes, [theta_i, coefficient, direction].
+
+        The mean over the nodes of a direction, with the sign of their side for the odd part,
+        which is exactly 0 for a field that is its own mirror image to rounding. A value that is
+        not finite makes its whole lane NaN.
+        """
+        value = np.where(np.isfinite(value), value, np.nan)  # infinities times 0 would warn
+        nodes = np.moveaxis(value.reshape(len(value), -1, value.shape[-1]), 1, 2)
+        share = np.zeros((self.index.size, len(self.weight)))
+        share[np.arange(self.index.size), self.index.ravel()] = 1 / self.weight[self.index.ravel()]
+        even, odd = nodes @ share, nodes @ (self.side.reshape(-1, 1) * share)
+        largest = np.max(np.abs(even), axis=2, keepdims=True)
+        return even, np.where(np.abs(odd).max(axis=2, keepdims=True) > SAME_VALUE * largest, odd, 0.0)
 
 
-def distinct_directions(theta_o: np.ndarray, phi_o: np.ndarray, *, folded: bool) -> DirectionSet:
-    """Return the distinct directions of a grid whose phi_o may hold both 0 and 2 pi.
+def distinct_directions(theta_o: np.ndarray, phi_o: np.ndarray) -> DirectionSet:
+    """Return the distinct directions of a grid.
 
     Args:
         theta_o: Axis [rad]; at 0 all azimuths are one direction.
-        phi_o: Axis [rad].
-        folded: Take phi_o and -phi_o as one direction.
+        phi_o: Axis [rad], symmetric about pi; may hold both 0 and 2 pi.
+
+    Raises:
+        ValueError: an axis that is not symmetric.
     """
-    theta, phi = np.meshgrid(theta_o, fold_azimuth(phi_o) if folded else wrap_azimuth(phi_o), indexing="ij")
-    phi = np.where((theta < SAME_ANGLE) | (phi > 2 * np.pi - SAME_ANGLE), 0.0, phi)
+    if not np.allclose(np.sort(wrap_azimuth(-phi_o)), np.sort(wrap_azimuth(phi_o)), rtol=0, atol=SAME_ANGLE):
+        raise ValueError("phi_o: expected nodes that are symmetric about the plane of incidence")
+    theta, azimuth = np.meshgrid(theta_o, wrap_azimuth(phi_o), indexing="ij")
+    phi = np.where(theta < SAME_ANGLE, 0.0, fold_azimuth(azimuth))
+    in_plane = (phi < SAME_ANGLE) | (phi > np.pi - SAME_ANGLE)
+    side = np.where(in_plane, 0.0, np.where(azimuth < np.pi, 1.0, -1.0))
     key = np.round(np.stack([theta.ravel(), phi.ravel()], axis=1) / SAME_ANGLE)
     _, first, index, count = np.unique(key, axis=0, return_index=True, return_inverse=True, return_counts=True)
     index = index.reshape(theta.shape)  # NumPy 2.0 gave it another shape
-    return DirectionSet(theta.ravel()[first], phi.ravel()[first], count.astype(float), index, folded)
-
-
-def is_bilateral(value: Float[np.ndarray, "theta_i theta_o phi_o coefficient"], phi_o: np.ndarray) -> bool:
-    """Return whether a field on a symmetric phi_o axis equals its own mirror image."""
-    if not np.allclose(phi_o + phi_o[::-1], 2 * np.pi, rtol=0, atol=SAME_ANGLE):
-        return False
-    largest = np.max(np.abs(value), initial=0.0, where=np.isfinite(value))
-    return np.allclose(value, value[:, :, ::-1], rtol=0, atol=SAME_VALUE * largest, equal_nan=True)
+    return DirectionSet(theta.ravel()[first], phi.ravel()[first], count.astype(float), index, side)

@@ -16,17 +16,14 @@ from sbrdf_jax.angles import MIRROR_AZIMUTH, angle_between
 from sbrdf_jax.lobes import lobe_exponents
 from sbrdf_jax.records import Status
 from sbrdf_jax.representation.background import fit_background
+from sbrdf_jax.representation.critical_angle import critical_candidates
 from sbrdf_jax.representation.directions import DirectionSet
 from sbrdf_jax.representation.lobe_fit import Lobe, best_start, fit_lobe, width_bank
 
-CANDIDATES = 21
-FALLEN = 0.05  # of the far median: a coefficient this close to it has no lobe left
-HALVINGS = 36  # after which a lobe is 1e-11 of its height
-ROUNDING = 1e-9  # rad
 PAIR_BLOCK = 64  # searched before the next ones, to bound the memory
 PAIR_BATCH = 16  # in one call
 LANE_BATCH = 64  # in one call: arrays of so many lanes stay in the processor's cache
-POLISH_ROUNDS = 10
+POLISH_ROUNDS = 40
 
 
 class LobeKinds(NamedTuple):
@@ -36,31 +33,44 @@ class LobeKinds(NamedTuple):
     widths: Float[np.ndarray, "kind width"]  # bank of each, from the least width to the greatest
 
 
+class Functions(NamedTuple):
+    """The harmonics at the directions, made orthonormal over their weights."""
+
+    even: Float[np.ndarray, "direction even"]
+    odd: Float[np.ndarray, "direction odd"]
+    weight: Float[np.ndarray, " direction"]  # how often each direction counts
+
+
 class Pairs(NamedTuple):
     """What a search starts from; NumPy on the host."""
 
-    value: Float[np.ndarray, "pair direction"]  # about 1 at its largest
+    value: Float[np.ndarray, "pair direction"]  # the part that is even in phi_o, about 1 at its largest
+    odd: Float[np.ndarray, "pair direction"]  # the other part
     alpha: Float[np.ndarray, "pair direction"]  # rad, from the lobe's peak
     exponent: Float[np.ndarray, "pair kind direction"]  # s(alpha) of each kind
-
-
-class Winners(NamedTuple):
-    """The best lane of each pair."""
-
-    critical_angle: Float[np.ndarray, " pair"]  # rad
-    background: Float[np.ndarray, "pair function"]
-    kind: Int[np.ndarray, " pair"]  # place in LOBE_KINDS
-    lobe: Lobe  # arrays [pair]
 
 
 class Lanes(NamedTuple):
     """What a search found, for every candidate and kind."""
 
     critical_angle: Float[np.ndarray, "pair candidate"]  # rad
-    background: Float[np.ndarray, "pair candidate function"]  # of the orthonormal harmonics
-    target: Float[np.ndarray, "pair candidate direction"]  # what the background leaves
+    even: Float[np.ndarray, "pair candidate even"]  # background, of `Functions`
+    odd: Float[np.ndarray, "pair candidate odd"]
+    odd_error: Float[np.ndarray, "pair candidate"]  # weighted sum of squares, which no lobe changes
+    target: Float[np.ndarray, "pair candidate direction"]  # what the even background leaves
     inside: Bool[np.ndarray, "pair candidate direction"]  # directions within the critical angle
     lobe: Lobe  # arrays [pair, candidate, kind]
+
+
+class Winners(NamedTuple):
+    """The best lane of each pair."""
+
+    critical_angle: Float[np.ndarray, " pair"]  # rad
+    even: Float[np.ndarray, "pair even"]
+    odd: Float[np.ndarray, "pair odd"]
+    kind: Int[np.ndarray, " pair"]  # place in LOBE_KINDS
+    lobe: Lobe  # arrays [pair]
+    error: Float[np.ndarray, " pair"]  # weighted sum of squares, of both parts
 
 
 def lobe_kinds(index: tuple[int, ...], grid_step: float) -> LobeKinds:
@@ -74,51 +84,37 @@ def lobe_geometry(
 ) -> tuple[Float[np.ndarray, "peak direction"], Float[np.ndarray, "peak kind direction"]]:
     """Return the angle of every direction from each peak [rad] at the mirror azimuth, and s of all `LOBE_KINDS`."""
     axes = (directions.theta_o, directions.phi_o)
-    return _in_batches(lambda peak: _geometry(peak, *axes), LANE_BATCH, peak_theta)
+    alpha, exponent = _in_batches(lambda peak: _geometry(peak, *axes), LANE_BATCH, (peak_theta,))
+    return alpha, exponent
 
 
-def critical_candidates(pairs: Pairs, num_functions: int) -> Float[np.ndarray, "pair candidate"]:
-    """Return uniform candidates for the critical angle [rad] of each pair.
-
-    From the half-width of the lobe (three directions inside, at least) to the angle where the
-    coefficient has fallen to its far median, within 5 % of that: the median of the farther half
-    of the directions. Where a lobe of that half-width reaches further, by any kind that is
-    tried, the range ends where it has vanished: only then is the background outside free of
-    it. As many directions as the background has functions stay outside.
-    """
-    order = np.argsort(pairs.alpha, axis=1)
-    value, alpha = (np.take_along_axis(array, order, 1) for array in (pairs.value, pairs.alpha))
-    exponent = np.take_along_axis(pairs.exponent, order[:, None], 2)
-    far = np.median(value[:, value.shape[1] // 2 :], axis=1, keepdims=True)
-    above = np.abs(value - far)
-    half = _first(above <= above[:, :3].max(axis=1, keepdims=True) / 2)
-    fallen = _first(above <= FALLEN * np.abs(far))
-    vanished = _first(np.all(exponent >= HALVINGS * np.take_along_axis(exponent, half[:, None], 2), axis=1))
-    most = np.minimum(alpha[:, [max(alpha.shape[1] - num_functions - 1, 0)]], np.pi / 2)
-    lower = np.minimum(np.take_along_axis(alpha, np.maximum(half, 2), 1) + ROUNDING, most)
-    upper = np.clip(np.take_along_axis(alpha, np.maximum(fallen, vanished), 1), lower, most)
-    return np.linspace(lower[:, 0], upper[:, 0], CANDIDATES, axis=1)
-
-
-def search_lanes(
-    pairs: Pairs, kinds: LobeKinds, functions: Float[np.ndarray, "direction function"], weight: np.ndarray
-) -> Lanes:
+def search_lanes(pairs: Pairs, kinds: LobeKinds, functions: Functions) -> Lanes:
     """Fit background and lobe for every candidate and kind of every pair.
 
     Args:
         pairs: Coefficients, finite, scaled so that each is about 1 at its largest.
         kinds: Which lobes.
-        functions: The orthonormal harmonics at the directions.
-        weight: How often each direction counts.
+        functions: The harmonics.
     """
-    critical_angle = critical_candidates(pairs, functions.shape[1])
-    background, height, width = _in_batches(
-        lambda *pair: _prepare(*pair, kinds.widths, functions, weight), PAIR_BATCH, *pairs, critical_angle
+    weight = functions.weight
+    critical_angle = critical_candidates(pairs.value, pairs.alpha, pairs.exponent, functions.even.shape[1])
+    even, height, width = _in_batches(
+        lambda *pair: _prepare(*pair, kinds.widths, functions.even, weight),
+        PAIR_BATCH,
+        (pairs.value, pairs.alpha, pairs.exponent, critical_angle),
     )
-    target = pairs.value[:, None] - background @ functions.T
+    odd = np.zeros((*critical_angle.shape, functions.odd.shape[1]))
+    if pairs.odd.any() and odd.size:
+        odd, *_ = _in_batches(
+            lambda *pair: (_fit_backgrounds(*pair, functions.odd, weight),),
+            PAIR_BATCH,
+            (pairs.odd, pairs.alpha, critical_angle),
+        )
+    odd_error = (pairs.odd[:, None] - odd @ functions.odd.T) ** 2 @ weight
+    target = pairs.value[:, None] - even @ functions.even.T
     inside = pairs.alpha[:, None] <= critical_angle[..., None]
     lobe = fit_lanes(target, inside, pairs.exponent[:, None], (height, width), kinds, weight)
-    return Lanes(critical_angle, background, target, inside, lobe)
+    return Lanes(critical_angle, even, odd, odd_error, target, inside, lobe)
 
 
 def fit_lanes(
@@ -154,16 +150,16 @@ def fit_lanes(
         height, width = (array.ravel()[place] for array in start)
         return _fit_batch(*lane, weight, (height, width), kinds.widths[kind][:, [0, -1]])
 
-    found = _in_batches(fit, LANE_BATCH, place)
+    found = _in_batches(fit, LANE_BATCH, (place,))
     return Lobe(*(array.reshape(shape) if only is None else array for array in found))
 
 
-def search(pairs: Pairs, kinds: LobeKinds, functions: np.ndarray, weight: np.ndarray) -> Winners:
+def search(pairs: Pairs, kinds: LobeKinds, functions: Functions) -> Winners:
     """Return the best lane of each pair; `search_lanes`, a block of pairs at a time to bound the memory."""
     blocks = []
     for start in range(0, len(pairs.value), PAIR_BLOCK):
         block = Pairs(*(array[start : start + PAIR_BLOCK] for array in pairs))
-        blocks.append(best_lanes(search_lanes(block, kinds, functions, weight), block, kinds, weight))
+        blocks.append(best_lanes(search_lanes(block, kinds, functions), block, kinds, functions.weight))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
 
 
@@ -175,22 +171,25 @@ def best_lanes(lanes: Lanes, pairs: Pairs, kinds: LobeKinds, weight: Float[np.nd
     """
     shape = lanes.lobe.error.shape
     pair = np.arange(shape[0])
-    best = least(lanes.lobe.error) + pair * (shape[1] * shape[2])
+    best = least(lanes.lobe.error + lanes.odd_error[..., None]) + pair * (shape[1] * shape[2])
     flat = Lobe(*(array.ravel() for array in lanes.lobe))
     for _ in range(POLISH_ROUNDS):
-        slow = best[flat.status[best] == Status.MAX_STEPS]
-        if not slow.size:
+        unfinished = best[flat.status[best] == Status.MAX_STEPS]
+        if not unfinished.size:
             break
         start = flat.height.reshape(shape), flat.width.reshape(shape)
-        again = fit_lanes(lanes.target, lanes.inside, pairs.exponent[:, None], start, kinds, weight, only=slow)
+        again = fit_lanes(lanes.target, lanes.inside, pairs.exponent[:, None], start, kinds, weight, only=unfinished)
         for whole, part in zip(flat, again, strict=True):
-            whole[slow] = part
+            whole[unfinished] = part
     _, candidate, kind = np.unravel_index(best, shape)
+    lobe = Lobe(*(array[best] for array in flat))
     return Winners(
         lanes.critical_angle[pair, candidate],
-        lanes.background[pair, candidate],
+        lanes.even[pair, candidate],
+        lanes.odd[pair, candidate],
         np.array(kinds.index)[kind],
-        Lobe(*(array[best] for array in flat)),
+        lobe,
+        lobe.error + lanes.odd_error[pair, candidate],
     )
 
 
@@ -206,7 +205,7 @@ def _geometry(peak_theta, theta_o, phi_o):
 
 @jax.jit
 def _prepare(value, alpha, exponent, critical_angle, widths, functions, weight):
-    """Return background [pair, candidate, function], start height and start width [pair, candidate, kind]."""
+    """Return even background [pair, candidate, even], start height and start width [pair, candidate, kind]."""
 
     def candidate(value, alpha, exponent, critical_angle):
         outside = alpha > critical_angle
@@ -221,6 +220,16 @@ def _prepare(value, alpha, exponent, critical_angle, widths, functions, weight):
     return jax.vmap(of_pair)(value, alpha, exponent, critical_angle)
 
 
+@jax.jit
+def _fit_backgrounds(value, alpha, critical_angle, functions, weight):
+    """Return backgrounds [pair, candidate, function]."""
+
+    def candidate(value, alpha, critical_angle):
+        return fit_background(value, alpha > critical_angle, functions, weight)
+
+    return jax.vmap(jax.vmap(candidate, (None, None, 0)))(value, alpha, critical_angle)
+
+
 _fit_batch = jax.jit(jax.vmap(fit_lobe, in_axes=(0, 0, 0, None, 0, 0)))
 
 
@@ -229,13 +238,7 @@ def least(error: Float[np.ndarray, " pair *choice"]) -> Int[np.ndarray, " pair"]
     return np.where(np.isnan(error), np.inf, error).reshape(len(error), -1).argmin(axis=1)
 
 
-def _first(condition):
-    """Return, for each pair, the place of the first direction that meets a condition; the last one if none does."""
-    first = np.where(condition.any(axis=1), condition.argmax(axis=1), condition.shape[1] - 1)
-    return first[:, None]
-
-
-def _in_batches(function, size, *arrays):
+def _in_batches(function, size, arrays):
     """Call a function on batches of the leading axis, the last one filled with copies; NumPy arrays, joined."""
     count = len(arrays[0])
     answers = []

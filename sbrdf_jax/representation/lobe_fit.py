@@ -15,10 +15,10 @@ BANK_SIZE = 48
 WIDEST = 30.0  # beyond it no grid tells a lobe from a constant and a slope
 NARROWEST_DROP = 1000.0  # the narrowest lobe falls by this factor within one step of the grid
 MAX_STEPS = 12
-TOLERANCE = 1e-5  # of the largest target; a fit without a misfit converges quadratically, far below it
+TOLERANCE = 1e-7  # of the largest target
 # Levenberg-Marquardt starts with damping 1: too much beside an optimum for residuals of size 1,
-# while 1e4 would take a dozen rejected steps before damping is felt at all.
-RESIDUAL_SCALE = 1e3
+# while 1e3 would take a dozen rejected steps before damping is felt at all.
+RESIDUAL_SCALE = 1e2
 STATIONARY = 1e-6  # share of the squared error that one more step may promise
 NOISE_POWER = 0.6  # a residual below epsilon to this power (4e-10 in float64), of the largest target, is noise
 

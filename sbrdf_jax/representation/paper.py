@@ -18,7 +18,8 @@ from sbrdf_jax.lobes import LOBE_KINDS, lobe_value_any
 from sbrdf_jax.options import RepresentOptions
 from sbrdf_jax.records import CompactBRDF, SpectralField, Status
 from sbrdf_jax.representation.background import orthonormal_harmonics
-from sbrdf_jax.representation.directions import distinct_directions, is_bilateral
+from sbrdf_jax.representation.critical_angle import CANDIDATES
+from sbrdf_jax.representation.directions import distinct_directions
 
 DEFAULT_MAX_DEGREE = 4
 ENOUGH = 0.01  # relative error of a lane: what the background leaves, or a lobe takes off it, that calls for a lobe
@@ -42,6 +43,7 @@ def compact_coefficient(
     Returns:
         Coefficients [1/sr] of the spectral basis.
     """
+    theta_o, phi_o = jnp.asarray(theta_o), jnp.asarray(phi_o)
     harmonic = real_harmonics(theta_o, phi_o, compact.max_degree)
     background = jnp.asarray(compact.background)[i_theta]
     smooth = jnp.einsum("...h,...ch->...c", harmonic, background)
@@ -77,11 +79,11 @@ def represent(field: SpectralField, options: RepresentOptions) -> tuple[CompactB
     chosen = LOBE_KINDS[1:] if options.lobe == "best" else (options.lobe,)
     kinds = lane_search.lobe_kinds(tuple(LOBE_KINDS.index(kind) for kind in chosen), np.diff(theta_o).min())
 
-    node_value = np.asarray(field.coefficient, np.float64)
-    directions = distinct_directions(theta_o, phi_o, folded=is_bilateral(node_value, phi_o))
-    harmonics = orthonormal_harmonics(directions, max_degree)
-    functions, weight = harmonics.value, directions.weight
-    value, scale = _scaled_lanes(directions.merge(node_value))
+    directions = distinct_directions(theta_o, phi_o)
+    even_harmonics = orthonormal_harmonics(directions, max_degree)
+    odd_harmonics = orthonormal_harmonics(directions, max_degree, even=False)
+    functions = lane_search.Functions(even_harmonics.value, odd_harmonics.value, directions.weight)
+    value, odd_value, scale = _scaled_lanes(*directions.split(np.asarray(field.coefficient, np.float64)))
 
     known = value * np.nan_to_num(scale)[..., None]
     mean = np.asarray(mean_spectrum(np.moveaxis(known, 1, 2), field.basis))
@@ -89,8 +91,10 @@ def represent(field: SpectralField, options: RepresentOptions) -> tuple[CompactB
     peak = refine_peaks(mean, theta_i, plane, directions, kinds, functions)
 
     # the background alone, for every lane: from here on a lane is only ever improved
-    background = (value * weight) @ functions
-    energy, error = value**2 @ weight, (value - background @ functions.T) ** 2 @ weight
+    weight = directions.weight
+    even, odd = (value * weight) @ functions.even, (odd_value * weight) @ functions.odd
+    error = (value - even @ functions.even.T) ** 2 @ weight + (odd_value - odd @ functions.odd.T) ** 2 @ weight
+    energy = (value**2 + odd_value**2) @ weight
     reason = np.select([np.isnan(scale), energy == 0, error < ENOUGH**2 * energy], [3, 2, 1], 0)
     kind, height, width = np.zeros(scale.shape, int), np.zeros(scale.shape), np.ones(scale.shape)
     critical_angle = np.full(scale.shape, np.nan)
@@ -99,19 +103,19 @@ def represent(field: SpectralField, options: RepresentOptions) -> tuple[CompactB
     lane = np.nonzero(reason == 0)
     if lane[0].size:
         alpha, exponent = lane_search.lobe_geometry(peak, directions)
-        pairs = lane_search.Pairs(value[lane], alpha[lane[0]], exponent[lane[0]][:, kinds.index])
-        best = lane_search.search(pairs, kinds, functions, weight)
-        gain = np.sqrt(error[lane]) - np.sqrt(best.lobe.error)
-        gains = gain >= ENOUGH * np.sqrt(energy[lane])
+        geometry = alpha[lane[0]], exponent[lane[0]][:, kinds.index]
+        best = lane_search.search(lane_search.Pairs(value[lane], odd_value[lane], *geometry), kinds, functions)
+        gains = np.sqrt(error[lane]) - np.sqrt(best.error) >= ENOUGH * np.sqrt(energy[lane])
         lane = (lane[0][gains], lane[1][gains])
-        background[lane], critical_angle[lane] = best.background[gains], best.critical_angle[gains]
+        even[lane], odd[lane], critical_angle[lane] = best.even[gains], best.odd[gains], best.critical_angle[gains]
         kind[lane], height[lane] = best.kind[gains], best.lobe.height[gains] * scale[lane]
         width[lane], status[lane] = best.lobe.width[gains], best.lobe.status[gains]
 
+    background = even @ even_harmonics.to_harmonics.T + odd @ odd_harmonics.to_harmonics.T
     compact = CompactBRDF(
         theta_i,
         field.basis,
-        (background * scale[..., None]) @ harmonics.to_harmonics.T,
+        background * scale[..., None],
         kind,
         height,
         width,
@@ -121,18 +125,17 @@ def represent(field: SpectralField, options: RepresentOptions) -> tuple[CompactB
         max_degree=max_degree,
         interpolate_theta_i=field.interpolate_theta_i,
     )
-    num_fits = int((reason == 0).sum()) * lane_search.CANDIDATES * len(kinds.index)
+    num_fits = int((reason == 0).sum()) * CANDIDATES * len(kinds.index)
     return compact, {"lane_reason": reason, "reason_names": LANE_REASONS, "num_lobe_fits": num_fits}
 
 
-def _scaled_lanes(value):
+def _scaled_lanes(even, odd):
     """Return lanes [theta_i, coefficient, direction] whose largest value is 1, and what they were divided by.
 
     A lane with a value that is not finite is 0, and its scale NaN.
     """
-    value = np.moveaxis(value, 1, 2)
-    is_finite = np.isfinite(value).all(axis=2)
-    value = np.where(is_finite[..., None], value, 0.0)
-    largest = np.abs(value).max(axis=2)
+    is_finite = np.isfinite(even).all(axis=2, keepdims=True)
+    even, odd = np.where(is_finite, even, 0.0), np.where(is_finite, odd, 0.0)
+    largest = np.maximum(np.abs(even), np.abs(odd)).max(axis=2, keepdims=True)
     scale = np.where(largest > 0, largest, 1.0)
-    return value / scale[..., None], np.where(is_finite, scale, np.nan)
+    return even / scale, odd / scale, np.where(is_finite, scale, np.nan)[..., 0]

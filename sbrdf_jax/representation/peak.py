@@ -7,9 +7,10 @@ from jaxtyping import Float, Int
 
 from sbrdf_jax.angles import MIRROR_AZIMUTH, fold_azimuth
 from sbrdf_jax.lobes import LOBE_KINDS
+from sbrdf_jax.representation.critical_angle import CANDIDATES
 from sbrdf_jax.representation.directions import SAME_ANGLE, DirectionSet
 from sbrdf_jax.representation.lane_search import (
-    CANDIDATES,
+    Functions,
     LobeKinds,
     Pairs,
     fit_lanes,
@@ -94,7 +95,7 @@ def refine_peaks(
     plane: PlaneOfIncidence,
     directions: DirectionSet,
     kinds: LobeKinds,
-    functions: Float[np.ndarray, "direction function"],
+    functions: Functions,
 ) -> Float[np.ndarray, " theta_i"]:
     """Return where the lobe of each incident angle points: theta_o of its peak [rad], at the mirror azimuth.
 
@@ -106,14 +107,14 @@ def refine_peaks(
     mean = mean / np.where(largest > 0, largest, 1.0)
     first = lobe_peaks(plane, mean, theta_i)
     alpha, exponent = lobe_geometry(first, directions)
-    lanes = search_lanes(Pairs(mean, alpha, exponent[:, kinds.index]), kinds, functions, directions.weight)
+    lanes = search_lanes(Pairs(mean, np.zeros_like(mean), alpha, exponent[:, kinds.index]), kinds, functions)
 
     shape = lanes.lobe.height.shape
     rest, angle = lanes.target.reshape(-1, mean.shape[1]), np.repeat(theta_i, CANDIDATES)
     moved = np.stack([lobe_peaks(plane, rest, angle, LOBE_KINDS[k]) for k in kinds.index], axis=-1)
     _, exponent = lobe_geometry(moved.ravel(), directions)
     exponent = exponent[np.arange(moved.size), np.tile(kinds.index, len(rest))].reshape(*shape, -1)
-    again = fit_lanes(lanes.target, lanes.inside, exponent, lanes.lobe[:2], kinds, directions.weight)
+    again = fit_lanes(lanes.target, lanes.inside, exponent, lanes.lobe[:2], kinds, functions.weight)
 
     peaks = np.stack([np.broadcast_to(first[:, None, None], shape), moved.reshape(shape)], axis=1)
     best = least(np.stack([lanes.lobe.error, again.error], axis=1))

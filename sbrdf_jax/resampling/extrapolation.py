@@ -40,7 +40,9 @@ def extrapolated_nodes(samples: RawSamples, grid: Grid) -> np.ndarray:
         if near.any():
             distance, _ = scipy.spatial.cKDTree(directions[near]).query(nodes)
             flags[index, distance <= chord] = MEASURED
-    beyond = (theta_o > samples.theta_o.max() + 1e-9) | (theta_o < samples.theta_o.min() - 1e-9)
+    beyond = theta_o > samples.theta_o.max() + 1e-9
+    if samples.theta_o.min() > reach:  # a hole round the normal; a narrower one is between samples on all sides
+        beyond |= theta_o < samples.theta_o.min() - 1e-9
     beyond |= _in_azimuth_gap(phi_o, phi_sample[samples.theta_o > 1e-6], grid.bilateral) & (theta_o > 0)
     flags[:, beyond] = BEYOND
     outside = (grid.theta_i > samples.theta_i.max() + 1e-9) | (grid.theta_i < samples.theta_i.min() - 1e-9)
