@@ -75,7 +75,7 @@ class Winners(NamedTuple):
 
 def lobe_kinds(index: tuple[int, ...], grid_step: float) -> LobeKinds:
     """Return the kinds to try on a grid of a step [rad] that bounds their widths from below."""
-    of_step = np.asarray(lobe_exponents(np.array([grid_step])))[:, 0]
+    of_step = np.asarray(_exponents(np.array([grid_step])))[:, 0]
     return LobeKinds(index, np.stack([width_bank(of_step[k]) for k in index]))
 
 
@@ -230,6 +230,7 @@ def _fit_backgrounds(value, alpha, critical_angle, functions, weight):
     return jax.vmap(jax.vmap(candidate, (None, None, 0)))(value, alpha, critical_angle)
 
 
+_exponents = jax.jit(lobe_exponents)
 _fit_batch = jax.jit(jax.vmap(fit_lobe, in_axes=(0, 0, 0, None, 0, 0)))
 
 
