@@ -24,7 +24,7 @@ def main(materials: list[str]) -> None:
     set_up_jax()
     from sbrdf_jax.colour import colour_matching
     from sbrdf_jax.config import parse_config, resolve
-    from sbrdf_jax.encoding import encode_field
+    from sbrdf_jax.encoding import encode_field, make_basis
     from sbrdf_jax.formats import read
     from sbrdf_jax.lobes import LOBE_KINDS
     from sbrdf_jax.metrics import error_at_nodes, error_split
@@ -38,7 +38,7 @@ def main(materials: list[str]) -> None:
         raw = read(options.input.path, options.input)
         ready = prepare(raw, options)
         gridded = resample(ready.cleaned.samples, ready.grid, options.resample)
-        field = encode_field(gridded, ready.basis)
+        field = encode_field(gridded, make_basis(raw.wavelength_nm, options.encode.basis, options.encode.coefficients))
         matching = colour_matching(np.asarray(gridded.wavelength_nm))
         angles = np.rad2deg(np.asarray(gridded.theta_i))
         print(f"{material}: eta [%] by incident angle; last two columns: seconds warm, the paper's value at 0 degrees")
