@@ -49,7 +49,8 @@ def main(argv: Sequence[str]) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.add_arguments(parser)
-    signal.signal(signal.SIGTERM, _terminate)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _stop)
     try:
         return command.run(parser.parse_intermixed_args(rest))
     except UserError as error:
@@ -64,6 +65,8 @@ def main(argv: Sequence[str]) -> int:
     except Exception as error:
         print(f"sbrdf {verb}: unexpected {type(error).__name__}: {first_line(error)}", file=sys.stderr)
         return UNEXPECTED
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 def main_exit() -> None:
@@ -81,5 +84,10 @@ def _overview() -> str:
     return f"usage: sbrdf COMMAND ...\n\n{rows}\n\nsbrdf COMMAND --help shows an example."
 
 
-def _terminate(_signum, _frame):
+def _stop(number: int, _frame):
+    # An exception raised inside a callback of compiled code is lost there: so it is raised again, a second later.
+    signal.signal(signal.SIGALRM, lambda _number, frame: _stop(number, frame))
+    signal.setitimer(signal.ITIMER_REAL, 1.0)
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
     raise SystemExit(TERMINATED)

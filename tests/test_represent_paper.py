@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.special import sph_harm_y
-from tolerances import PLANTED, tolerance
+from tolerances import PLANTED, ROUNDING, tolerance
 
 from sbrdf_jax import builtin, encoding
 from sbrdf_jax.errors import UserError
@@ -16,8 +16,9 @@ from sbrdf_jax.lobes import LOBE_KINDS, lobe_exponents
 from sbrdf_jax.options import RepresentOptions
 from sbrdf_jax.records import CompactBRDF, SpectralField, Status
 from sbrdf_jax.representation import lane_search, represent, represent_with_plan
-from sbrdf_jax.representation.background import orthonormal_harmonics
+from sbrdf_jax.representation.background import fit_background, orthonormal_harmonics
 from sbrdf_jax.representation.directions import distinct_directions
+from sbrdf_jax.representation.lobe_fit import Lobe
 from sbrdf_jax.representation.paper import LANE_REASONS, compact_coefficient
 from sbrdf_jax.representation.peak import lobe_peaks, plane_of_incidence
 from sbrdf_jax.runtime import compile_clock
@@ -133,6 +134,29 @@ def test_background_equals_lstsq_on_the_raw_harmonics_of_all_nodes():
             np.testing.assert_allclose(found[EVEN], expected, atol=1e-6 * scale)
             np.testing.assert_allclose(found[~EVEN], 0)
             np.testing.assert_allclose((raw @ found[EVEN])[outside], (raw @ expected)[outside], atol=1e-9)
+
+
+def test_a_background_seen_from_outside_a_wide_cone_comes_back(rng):
+    directions = distinct_directions(THETA_O, PHI_O)
+    functions = orthonormal_harmonics(directions, 8).value
+    gram = functions.T @ (directions.weight[:, None] * functions)
+    np.testing.assert_allclose(gram, np.eye(len(gram)), atol=tolerance(ROUNDING, np.float64))
+    alpha, _ = lane_search.lobe_geometry(np.array([0.5]), directions)
+    outside = alpha[0] > np.radians(46.0)  # eigenvalues of the Gram matrix down to 1e-6
+    planted_coefficient = rng.normal(size=len(gram))
+    value = functions @ planted_coefficient
+    found = jax.jit(fit_background)(*(jax.numpy.asarray(a) for a in (value, outside, functions, directions.weight)))
+    np.testing.assert_allclose(functions @ found, value, atol=tolerance(ROUNDING, np.float64) * np.abs(value).max())
+
+
+def test_the_winner_counts_the_part_that_no_lobe_touches():
+    nothing, one = np.zeros((1, 2, 1)), np.ones((1, 2, 1))
+    lobe = Lobe(one, one, np.zeros((1, 2, 1), int), np.zeros((1, 2, 1), int), np.array([[[1.0], [2.0]]]))
+    critical_angle, odd_error = np.array([[0.3, 0.6]]), np.array([[5.0, 1.0]])
+    lanes = lane_search.Lanes(critical_angle, nothing, nothing, odd_error, nothing, nothing > 0, lobe)
+    pairs = lane_search.Pairs(*(np.zeros((1, 1)),) * 3, np.zeros((1, 1, 1)))
+    best = lane_search.best_lanes(lanes, pairs, lane_search.LobeKinds((2,), np.ones((1, 2))), np.ones(1))
+    assert (best.critical_angle, best.error, best.kind) == (0.6, 3.0, 2)
 
 
 def test_stationary_lobes_are_no_worse_than_scipys_from_many_starts(rng):

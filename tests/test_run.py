@@ -203,22 +203,17 @@ def test_a_stopped_run_leaves_nothing_under_the_output_name(folder, tmp_path, se
     words = ["-m", "sbrdf_jax.run", str(folder / "config.yaml"), "grid.theta_i_step_deg=7.5", "output.path=x.h5"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
 
-    def heed_interrupts() -> None:  # a background shell passes on that SIGINT is ignored
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-
     process = subprocess.Popen(
-        [sys.executable, *words],
-        cwd=tmp_path,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-        preexec_fn=heed_interrupts,
+        [sys.executable, *words], cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=environment
     )
     deadline = time.monotonic() + 120
     while not (tmp_path / "x.h5.log").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(sent)
-    _, errors = process.communicate(timeout=120)
+    try:
+        _, errors = process.communicate(timeout=240)
+    finally:
+        process.kill()
     assert process.returncode == code, errors
     assert "Traceback" not in errors
     assert sorted(p.name for p in tmp_path.iterdir()) == ["x.h5.log"]

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from sbrdf_jax.harmonics import harmonic_orders, real_harmonics
 from sbrdf_jax.representation.directions import DirectionSet
 
-REFINEMENTS = 2
+REFINEMENTS = 1
 TRUNCATION = 4096  # machine epsilons; eigenvalues below it, of the largest, count as 0
 
 
@@ -68,8 +68,8 @@ def fit_background(
 
     Numerics:
         The Gram matrix has eigenvalues from 0 to 1, how much of a function lies outside. Those
-        below `TRUNCATION` epsilons are dropped; two steps of refinement on the true residual
-        take back what squaring the condition number lost.
+        below `TRUNCATION` epsilons are dropped; a step of refinement on the true residual takes
+        back what squaring the condition number lost.
     """
     weighted = functions * jnp.where(outside, weight, 0.0)[:, None]
     eigenvalue, vector = jnp.linalg.eigh(weighted.T @ functions)
