@@ -7,13 +7,13 @@ but some lanes failed, 130 interrupted, 143 terminated.
 import argparse
 import importlib
 import os
-import signal
 import sys
 from collections.abc import Sequence
 
 from sbrdf_jax.errors import UserError
+from sbrdf_jax.stopping import INTERRUPTED, stop_on_signals
 
-UNEXPECTED, WRONG_INPUT, SOME_LANES_FAILED, INTERRUPTED, TERMINATED = 1, 2, 3, 130, 143
+UNEXPECTED, WRONG_INPUT, SOME_LANES_FAILED = 1, 2, 3
 
 COMMANDS = {
     "run": "from a measurement to a result, as a config says",
@@ -49,8 +49,6 @@ def main(argv: Sequence[str]) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.add_arguments(parser)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _stop)
     try:
         return command.run(parser.parse_intermixed_args(rest))
     except UserError as error:
@@ -65,13 +63,13 @@ def main(argv: Sequence[str]) -> int:
     except Exception as error:
         print(f"sbrdf {verb}: unexpected {type(error).__name__}: {first_line(error)}", file=sys.stderr)
         return UNEXPECTED
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
-def main_exit() -> None:
-    """Entry point of the console script."""
-    raise SystemExit(main(sys.argv[1:]))
+def main_exit(*verb: str) -> None:
+    """Run the process's own command line, after `verb` where the module names it, and end the process."""
+    argv = [*verb, *sys.argv[1:]]
+    stop_on_signals(" ".join(["sbrdf", *argv[:1]]))
+    raise SystemExit(main(argv))
 
 
 def first_line(error: BaseException) -> str:
@@ -82,12 +80,3 @@ def first_line(error: BaseException) -> str:
 def _overview() -> str:
     rows = "\n".join(f"  {name:<10} {summary}" for name, summary in COMMANDS.items())
     return f"usage: sbrdf COMMAND ...\n\n{rows}\n\nsbrdf COMMAND --help shows an example."
-
-
-def _stop(number: int, _frame):
-    # An exception raised inside a callback of compiled code is lost there: so it is raised again, a second later.
-    signal.signal(signal.SIGALRM, lambda _number, frame: _stop(number, frame))
-    signal.setitimer(signal.ITIMER_REAL, 1.0)
-    if number == signal.SIGINT:
-        raise KeyboardInterrupt
-    raise SystemExit(TERMINATED)

@@ -1,8 +1,6 @@
 """`python -m sbrdf_jax.evaluate`: see `sbrdf_jax/commands/evaluate.py`."""
 
-import sys
-
-from sbrdf_jax.cli import main
+from sbrdf_jax.cli import main_exit
 
 if __name__ == "__main__":
-    raise SystemExit(main(["evaluate", *sys.argv[1:]]))
+    main_exit("evaluate")

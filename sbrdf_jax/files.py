@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from sbrdf_jax.errors import UserError
+from sbrdf_jax.stopping import before_stopping
 
 
 @contextlib.contextmanager
@@ -33,9 +34,10 @@ def whole_file(path: str | os.PathLike) -> Iterator[Path]:
         if path.is_dir():
             raise UserError(f"{path}: cannot be written: it is a folder, expected a file name")
         remove_leftovers(path)
-        yield temporary
-        _sync(temporary)
-        os.replace(temporary, path)
+        with before_stopping(lambda _: temporary.unlink(missing_ok=True)):
+            yield temporary
+            _sync(temporary)
+            os.replace(temporary, path)
         _sync(path.parent)
     except OSError as error:
         reason = error.strerror or str(error).splitlines()[0]

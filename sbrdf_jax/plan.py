@@ -46,8 +46,13 @@ def plan_run(kept: RawSamples, num_read: int, grid: Grid, coefficients: int, opt
         PlanRow("resample", "wavelengths", wavelengths, wavelengths, "no scene: every wavelength"),
         PlanRow("encode", "coefficients", coefficients, wavelengths, f"basis {options.encode.basis}"),
         PlanRow("represent", "lanes", lanes, lanes, "incident angles x coefficients"),
-        PlanRow("represent", "lobe fits, at most", lanes * CRITICAL_ANGLES * kinds, lanes * CRITICAL_ANGLES * 3,
-                "lanes that the background explains are skipped"),
+        PlanRow(
+            "represent",
+            "lobe fits, at most",
+            lanes * CRITICAL_ANGLES * kinds,
+            lanes * CRITICAL_ANGLES * 3,
+            "lanes that the background explains are skipped",
+        ),
     ]
 
 

@@ -1,8 +1,6 @@
 """`python -m sbrdf_jax.run`: see `sbrdf_jax/commands/run.py`."""
 
-import sys
-
-from sbrdf_jax.cli import main
+from sbrdf_jax.cli import main_exit
 
 if __name__ == "__main__":
-    raise SystemExit(main(["run", *sys.argv[1:]]))
+    main_exit("run")

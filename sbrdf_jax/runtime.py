@@ -67,9 +67,9 @@ def _listen() -> None:
     if not _listening:
         import jax
 
-        def forward(event: str, duration: float, **details) -> None:
+        def forward(event: str, duration_secs: float, **details) -> None:
             for clock in _clocks:
-                clock._add(event, duration, **details)
+                clock._add(event, duration_secs, **details)
 
         jax.monitoring.register_event_duration_secs_listener(forward)
         _listening = True

@@ -75,13 +75,13 @@ def test_a_field_made_of_the_models_own_parts_comes_back(kind, rng):
     found, plan = represent_with_plan(field, PAPER)
     error = np.abs(at_nodes(found) - field.coefficient).max() / np.abs(field.coefficient).max()
     assert error < BACK
-    np.testing.assert_allclose(found.lobe_peak_theta_o, made_of.lobe_peak_theta_o, atol=BACK)
+    np.testing.assert_allclose(found.lobe_peak_theta_o, made_of.lobe_peak_theta_o, rtol=0, atol=BACK)
     np.testing.assert_array_equal(found.status, Status.OK)
     np.testing.assert_array_equal(plan["lane_reason"], LANE_REASONS.index("searched"))
     np.testing.assert_array_equal(found.lobe_kind, kind)
     np.testing.assert_allclose(found.lobe_height, made_of.lobe_height, rtol=1e-7)
     np.testing.assert_allclose(found.lobe_width, made_of.lobe_width, rtol=1e-7)
-    np.testing.assert_allclose(found.background, made_of.background, atol=1e-6)  # of condition number 562
+    np.testing.assert_allclose(found.background, made_of.background, rtol=0, atol=1e-6)  # of condition number 562
     assert np.all((found.critical_angle > HALF_WIDTH) & (found.critical_angle < np.pi / 2))
 
 
@@ -90,7 +90,7 @@ def test_without_mirror_symmetry_all_harmonics_take_part(rng):
     found = represent(field, dataclasses.replace(PAPER, lobe="angle_squared"))
     error = np.abs(at_nodes(found) - field.coefficient).max() / np.abs(field.coefficient).max()
     assert error < BACK
-    np.testing.assert_allclose(found.background, made_of.background, atol=1e-6)
+    np.testing.assert_allclose(found.background, made_of.background, rtol=0, atol=1e-6)
 
 
 def test_the_papers_case_is_below_its_error_for_each_kind_and_compiles_once():
@@ -131,22 +131,24 @@ def test_background_equals_lstsq_on_the_raw_harmonics_of_all_nodes():
             )
             found = harmonics.to_harmonics @ lanes.even[lane, candidate]
             scale = np.abs(expected).max()
-            np.testing.assert_allclose(found[EVEN], expected, atol=1e-6 * scale)
+            np.testing.assert_allclose(found[EVEN], expected, rtol=0, atol=1e-6 * scale)
             np.testing.assert_allclose(found[~EVEN], 0)
-            np.testing.assert_allclose((raw @ found[EVEN])[outside], (raw @ expected)[outside], atol=1e-9)
+            np.testing.assert_allclose((raw @ found[EVEN])[outside], (raw @ expected)[outside], rtol=0, atol=1e-9)
 
 
 def test_a_background_seen_from_outside_a_wide_cone_comes_back(rng):
     directions = distinct_directions(THETA_O, PHI_O)
     functions = orthonormal_harmonics(directions, 8).value
     gram = functions.T @ (directions.weight[:, None] * functions)
-    np.testing.assert_allclose(gram, np.eye(len(gram)), atol=tolerance(ROUNDING, np.float64))
+    np.testing.assert_allclose(gram, np.eye(len(gram)), rtol=0, atol=tolerance(ROUNDING, np.float64))
     alpha, _ = lane_search.lobe_geometry(np.array([0.5]), directions)
     outside = alpha[0] > np.radians(46.0)  # eigenvalues of the Gram matrix down to 1e-6
     planted_coefficient = rng.normal(size=len(gram))
     value = functions @ planted_coefficient
     found = jax.jit(fit_background)(*(jax.numpy.asarray(a) for a in (value, outside, functions, directions.weight)))
-    np.testing.assert_allclose(functions @ found, value, atol=tolerance(ROUNDING, np.float64) * np.abs(value).max())
+    np.testing.assert_allclose(
+        functions @ found, value, rtol=0, atol=tolerance(ROUNDING, np.float64) * np.abs(value).max()
+    )
 
 
 def test_the_winner_counts_the_part_that_no_lobe_touches():
@@ -233,13 +235,13 @@ def test_peaks_in_the_plane_of_incidence():
     peak = np.radians([0.0, 33.0, 0.0, 30.0, 90.0, 88.0])
     alpha, _ = lane_search.lobe_geometry(peak, directions)
     value = np.exp(-(alpha**2) / 0.05)
-    np.testing.assert_allclose(lobe_peaks(plane, value, theta_i), peak, atol=1e-12)
+    np.testing.assert_allclose(lobe_peaks(plane, value, theta_i), peak, rtol=0, atol=1e-12)
     assert plane.signed_theta[0] == -np.pi / 2 and np.all(np.diff(plane.signed_theta) > 0)
     value[1] = -1.0  # nothing positive: the mirror direction
     value[2] = alpha[2] < 0.01  # no logarithm beside the highest node: that node
     value[3] = directions.theta_o  # a parabola that opens upwards or not at all: the highest node
     found = lobe_peaks(plane, value, theta_i)[1:4]
-    np.testing.assert_allclose(found, [theta_i[1], 0.0, np.pi / 2], atol=1e-12)
+    np.testing.assert_allclose(found, [theta_i[1], 0.0, np.pi / 2], rtol=0, atol=1e-12)
 
 
 def test_evaluation_equals_its_twin_and_has_finite_gradients(rng):
@@ -258,10 +260,10 @@ def test_evaluation_equals_its_twin_and_has_finite_gradients(rng):
         height, width = compact.lobe_height[i], compact.lobe_width[i]
         lobe = [0, height[1] * np.exp(-(alpha**2) / width[1]), height[2] * np.exp(-np.tan(alpha) / width[2])]
         expected = compact.background[i] @ harmonic + np.where([True, True, alpha < np.pi / 2], lobe, 0)
-        np.testing.assert_allclose(found[j], expected, atol=1e-11)
+        np.testing.assert_allclose(found[j], expected, rtol=0, atol=1e-11)
 
     alone = jax.jit(jax.vmap(compact_coefficient, (None, 0, 0, 0)))(compact, node, theta, phi)
-    np.testing.assert_allclose(alone, found, atol=1e-13)
+    np.testing.assert_allclose(alone, found, rtol=0, atol=1e-13)
     for where in (compact.lobe_peak_theta_o, np.zeros(4), np.full(4, np.pi / 2)):  # the peak, the pole, the horizon
         assert all(np.isfinite(a).all() for a in slopes(compact, np.arange(4), where, np.full(4, np.pi)))
 
@@ -279,7 +281,7 @@ def test_the_two_parts_of_a_field_weigh_as_its_nodes(rng):
     value[:, :, -1] = value[:, :, 0]
     even, odd = directions.split(value)
     nodes = even[:, :, directions.index] + directions.side * odd[:, :, directions.index]
-    np.testing.assert_allclose(np.moveaxis(nodes, 1, -1), value, atol=1e-12)
+    np.testing.assert_allclose(np.moveaxis(nodes, 1, -1), value, rtol=0, atol=1e-12)
     np.testing.assert_allclose((even**2 + odd**2) @ directions.weight, np.sum(value**2, axis=(1, 2)), rtol=1e-12)
     assert not directions.split(value + value[:, :, ::-1])[1].any()
     with pytest.raises(ValueError, match="symmetric"):

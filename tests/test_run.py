@@ -216,6 +216,8 @@ def test_a_stopped_run_leaves_nothing_under_the_output_name(folder, tmp_path, se
         process.kill()
     assert process.returncode == code, errors
     assert "Traceback" not in errors
+    assert errors.splitlines()[-1].endswith("nothing was written under the output name")
+    assert "stopped: " in (tmp_path / "x.h5.log").read_text()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["x.h5.log"]
 
 

@@ -40,18 +40,19 @@ def run(args: argparse.Namespace) -> int:
 
     from sbrdf_jax.pipeline import prepare
     from sbrdf_jax.plan import plan_text
+    from sbrdf_jax.stopping import before_stopping
 
     ready = prepare(raw, options)
     if args.plan:
         print(plan_text(ready.rows))
         return 0
     output = Path(options.output.path)
-    with open_progress(output) as progress:
+    with open_progress(output) as progress, before_stopping(lambda word: progress.log(f"stopped: {word}")):
         progress.say(f"{raw.source}: {ready.cleaned.report.num_kept} of {raw.num_samples} samples kept")
         try:
             return _run(options, raw, ready, progress, time.perf_counter() - start)
-        except (UserError, KeyboardInterrupt, SystemExit) as error:
-            progress.log(f"stopped: {type(error).__name__} {error}".rstrip())
+        except UserError as error:
+            progress.log(f"stopped: {error}")
             raise
         except Exception as error:
             for line in traceback.format_exc().splitlines():

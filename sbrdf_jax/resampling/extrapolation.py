@@ -1,7 +1,7 @@
 """Where the data stand behind a node of the grid, and where nothing does."""
 
 import numpy as np
-import scipy.spatial
+from scipy.spatial import KDTree
 
 from sbrdf_jax.angles import fold_azimuth
 from sbrdf_jax.coverage import SAME_INCIDENCE
@@ -38,7 +38,7 @@ def extrapolated_nodes(samples: RawSamples, grid: Grid) -> np.ndarray:
     for index, angle in enumerate(grid.theta_i):
         near = np.abs(samples.theta_i - angle) <= step_i + 1e-9
         if near.any():
-            distance, _ = scipy.spatial.cKDTree(directions[near]).query(nodes)
+            distance, _ = KDTree(directions[near]).query(nodes)
             flags[index, distance <= chord] = MEASURED
     beyond = theta_o > samples.theta_o.max() + 1e-9
     if samples.theta_o.min() > reach:  # a hole round the normal; a narrower one is between samples on all sides

@@ -263,9 +263,7 @@ def normal_equations(
         left, right = np.repeat(np.eye(num_i), num_i, axis=0), np.tile(np.eye(num_i), (num_i, 1))
         planes = rhs.reshape(num_i, num_d, -1)
     else:
-        block, group_rhs = _grouped_sums(
-            terms.theta_o, terms.phi_o, is_sample, values, layout=layout, steps=steps
-        )
+        block, group_rhs = _grouped_sums(terms.theta_o, terms.phi_o, is_sample, values, layout=layout, steps=steps)
         left = right = terms.incidence
         planes = jnp.einsum("km,kdw->mdw", jnp.asarray(left), group_rhs)
     rows = second_difference_rows(grid)
