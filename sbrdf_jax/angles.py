@@ -55,3 +55,14 @@ def angle_between(
     # near pi the square root's slope is unbounded: atan2 keeps both ends accurate
     angle = 2 * jnp.arctan2(jnp.sqrt(safe), jnp.sqrt(jnp.maximum(1 - safe, 1e-300)))
     return jnp.where(is_zero, 0.0, angle)
+
+
+def half_angle(theta_i: np.ndarray, theta_o: np.ndarray, phi_o: np.ndarray) -> np.ndarray:
+    """Angle between the normal and the half vector of incidence and exitance [rad], on the host.
+
+    By the tangent of the half vector's components, not the arccosine, which loses half of the
+    digits near the mirror direction.
+    """
+    along = np.sin(theta_i) + np.sin(theta_o) * np.cos(phi_o)
+    across = np.sin(theta_o) * np.sin(phi_o)
+    return np.arctan2(np.hypot(along, across), np.cos(theta_i) + np.cos(theta_o))
