@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Mapping
 
 import h5py
 import numpy as np
@@ -15,8 +16,17 @@ from sbrdf_jax.hdf5 import attribute, dataset, dataset_of, degrees, read, scale
 from sbrdf_jax.lobes import LOBE_KINDS
 from sbrdf_jax.metrics import stored_numbers
 from sbrdf_jax.records import STATUS_TEXT, CompactBRDF, GriddedBRDF, SpectralBasis, SpectralField, Status
+from sbrdf_jax.scores import SCORE_TEXT
 
 _ANGLES = ("theta_i", "theta_o", "phi_o")
+
+# Axes and units of what validation stores, by the last part of the name; scores and counts have neither.
+VALIDATION_AXES = {
+    "predicted": ("row", "wavelength"),
+    "fold": ("row",),
+    "status": ("fit", "wavelength"),
+}
+VALIDATION_UNITS = {"predicted": "1/sr", "lower_deg": "deg", "upper_deg": "deg"}
 
 
 def write_grid(group: h5py.Group, gridded: GriddedBRDF) -> None:
@@ -90,6 +100,32 @@ def write_cleaning(group: h5py.Group, report: CleanReport) -> None:
     group.attrs["covers_both_half_planes"] = report.coverage.covers_both_half_planes
     group.attrs["covered"] = json.dumps(report.coverage.covered)
     group.attrs["missing"] = json.dumps(report.coverage.missing)
+
+
+def write_validation(group: h5py.Group, validation: Mapping[str, np.ndarray], grid: h5py.Group) -> None:
+    """Write held-out predictions, a row for each input row in file order, and their scores.
+
+    Args:
+        group: The empty group `validation`.
+        validation: Arrays by name; a name with "/" lies in a group of its own.
+        grid: The group `grid`, for the wavelengths.
+    """
+    wavelength = dataset_of(grid, "wavelength_nm")
+    for name, value in validation.items():
+        *parents, last = name.split("/")
+        inner = group.require_group("/".join(parents)) if parents else group
+        default = ("bin",) * np.ndim(value)
+        axes = []
+        for axis, size in zip(VALIDATION_AXES.get(last, default), np.shape(value), strict=True):
+            if axis != "wavelength" and axis not in inner:
+                scale(inner, axis, np.arange(size), "1")
+            axes.append(wavelength if axis == "wavelength" else dataset_of(inner, axis))
+        if last == "status":
+            status_dataset(inner, value, axes)
+            continue
+        written = dataset(inner, last, value, VALIDATION_UNITS.get(last, "1"), axes)
+        if last in SCORE_TEXT:
+            written.attrs["meaning"] = SCORE_TEXT[last]
 
 
 def status_dataset(group: h5py.Group, status, axes: list[h5py.Dataset]) -> None:

@@ -129,11 +129,11 @@ class ValidateOptions:
     __pydantic_config__ = _STRICT
 
     folds: Annotated[int, Ge(0)] = 0
-    """Number of folds, 2 or more; 0: off."""
+    """Number of random folds, 2 or more; 0: off. Mirror twins and repeats stay together."""
     leave_one_theta_i_out: bool = False
     """Hold out one incident angle at a time."""
     fold_file: Text | None = None
-    """CSV with columns row,fold, relative to the config file; row counts from 0 in file order."""
+    """CSV with columns row,fold, relative to the config file; row counts from 0 in file order. Wins over folds."""
     seed: Annotated[int, Ge(0), Le(2**32 - 1)] = 0
     """Seed of the random folds."""
 

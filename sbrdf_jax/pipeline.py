@@ -1,17 +1,18 @@
-"""Strings the stages together: a measurement and options in, a result out; no files."""
+"""Strings the stages together: a measurement and options in, a result out; no files but that of folds."""
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from sbrdf_jax.cleaning import CleanResult, clean
 from sbrdf_jax.encoding import coefficients_allowed, encode_field, make_basis
+from sbrdf_jax.folds import LEAVE_ONE_OUT, Folds, make_folds
 from sbrdf_jax.grid import Grid, make_grid
 from sbrdf_jax.metrics import live_wavelengths, measure
 from sbrdf_jax.options import RunOptions
-from sbrdf_jax.plan import PlanRow, plan_run
+from sbrdf_jax.plan import PlanRow, plan_run, plan_validation
 from sbrdf_jax.progress import Progress, StageClock
 from sbrdf_jax.records import STATUS_TEXT, GriddedBRDF, RawSamples, Status
 from sbrdf_jax.representation import represent_with_plan
@@ -19,6 +20,7 @@ from sbrdf_jax.resampling import resample
 from sbrdf_jax.runtime import compile_clock
 from sbrdf_jax.store import RunResult
 from sbrdf_jax.summary import count_statuses
+from sbrdf_jax.validation import validate
 
 FAILED = (Status.MAX_STEPS, Status.NONFINITE)
 
@@ -31,6 +33,7 @@ class Prepared:
     grid: Grid
     rows: list[PlanRow]
     warnings: tuple[str, ...]
+    folds: Mapping[str, Folds]  # by scheme; empty where validation is off
 
 
 def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
@@ -44,17 +47,19 @@ def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
         The cleaned samples, the grid, the plan, and what a user must be told.
 
     Raises:
-        UserError: The measurement is not enough for a grid.
+        UserError: The measurement is not enough for a grid or for its validation, or the fold file is wrong.
     """
     cleaned = clean(raw, bilateral=options.input.bilateral, method=options.resample.method)
     grid = make_grid(cleaned.samples, options.grid, bilateral=cleaned.report.bilateral)
     num_live = len(raw.wavelength_nm) - len(cleaned.report.dead_wavelength_nm)
     allowed = coefficients_allowed(num_live, int(options.encode.coefficients), options.encode.basis)
     rows = plan_run(cleaned.samples, raw.num_samples, grid, allowed.coefficients, options)
+    folds = make_folds(raw, cleaned.report, options.validate, mirror_twins=options.input.bilateral is not False)
+    rows += plan_validation(folds)
     warnings = [f"not measured: {text}" for text in cleaned.report.coverage.missing]
     if allowed.warning:
         warnings.append(allowed.warning)
-    return Prepared(cleaned, grid, rows, tuple(warnings))
+    return Prepared(cleaned, grid, rows, tuple(warnings), folds)
 
 
 def process(raw: RawSamples, ready: Prepared, options: RunOptions, progress: Progress) -> RunResult:
@@ -93,6 +98,12 @@ def process(raw: RawSamples, ready: Prepared, options: RunOptions, progress: Pro
     with _timed(progress, timing, "measure"):
         metrics = measure(gridded, field, compact, absolute=raw.quantity == "brdf")
 
+    validation = {}
+    if ready.folds:
+        with _timed(progress, timing, "validate"):
+            validation = validate(raw, ready.folds, ready.grid, options.resample, report, progress.update)
+            progress.update(f"{sum(len(folds.labels) for folds in ready.folds.values())} fits")
+
     return RunResult(
         gridded=gridded,
         field=field,
@@ -106,6 +117,7 @@ def process(raw: RawSamples, ready: Prepared, options: RunOptions, progress: Pro
             "num_samples": raw.num_samples,
             "notes": list(raw.notes),
         },
+        validation=validation,
         plan={
             "needed": {f"{row.stage} {row.what}": dataclasses.asdict(row) for row in ready.rows},
             "represent": searched,
@@ -133,6 +145,9 @@ def failed_lanes(result: RunResult) -> list[str]:
     stages = {"resample": (result.gridded.status, "wavelengths")}
     if result.compact is not None:
         stages["represent"] = (result.compact.status, "lanes")
+    for stage, group in (("validate", ""), (f"validate {LEAVE_ONE_OUT}", f"{LEAVE_ONE_OUT}/")):
+        if f"{group}status" in result.validation:
+            stages[stage] = (result.validation[f"{group}status"], "wavelengths of the folds")
     for stage, (status, what) in stages.items():
         status = np.asarray(status)
         for value in FAILED:
@@ -147,6 +162,8 @@ def failed_lanes(result: RunResult) -> list[str]:
 def _lane_name(result: RunResult, stage: str, index: np.ndarray) -> str:
     if stage == "resample":
         return f"{np.asarray(result.gridded.wavelength_nm)[index[0]]:g} nm"
+    if stage.startswith("validate"):
+        return f"fit {index[0] + 1}, {np.asarray(result.gridded.wavelength_nm)[index[1]]:g} nm"
     theta_i = np.rad2deg(np.asarray(result.gridded.theta_i)[index[0]])
     return f"theta_i {theta_i:g} degrees, coefficient {index[1]}"
 

@@ -1,7 +1,9 @@
 """What a run computes and what it skips, and why; decided on the host, before anything is traced."""
 
 import dataclasses
+from collections.abc import Mapping
 
+from sbrdf_jax.folds import Folds
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.options import RunOptions
 from sbrdf_jax.records import RawSamples
@@ -56,6 +58,12 @@ def plan_run(kept: RawSamples, num_read: int, grid: Grid, coefficients: int, opt
     ]
 
 
+def plan_validation(schemes: Mapping[str, Folds]) -> list[PlanRow]:
+    """Count the fits of held-out validation, a row per scheme: each is a resampling of its own."""
+    counts = {name: len(folds.labels) for name, folds in schemes.items()}
+    return [PlanRow("validate", name, counts[name], counts[name], folds.how) for name, folds in schemes.items()]
+
+
 def resample_bytes(grid: Grid, num_samples: int, num_groups: int, wavelengths: int) -> int:
     """Predict the memory of the resampling: the Kronecker sum's blocks and the solver's arrays [bytes]."""
     layout = Layout.of(grid)
@@ -65,6 +73,6 @@ def resample_bytes(grid: Grid, num_samples: int, num_groups: int, wavelengths: i
 
 def plan_text(rows: list[PlanRow]) -> str:
     """Return the plan as a table."""
-    lines = [f"{'stage':<10} {'what':<20} {'needed':>10} {'total':>10}  why"]
-    lines += [f"{r.stage:<10} {r.what:<20} {r.needed:>10} {r.total:>10}  {r.reason}" for r in rows]
+    lines = [f"{'stage':<10} {'what':<21} {'needed':>10} {'total':>10}  why"]
+    lines += [f"{r.stage:<10} {r.what:<21} {r.needed:>10} {r.total:>10}  {r.reason}" for r in rows]
     return "\n".join(lines)

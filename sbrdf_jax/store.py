@@ -41,6 +41,7 @@ from sbrdf_jax.layout import (
     write_compact,
     write_field,
     write_grid,
+    write_validation,
 )
 from sbrdf_jax.metrics import METRIC_AXES, METRIC_UNITS
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, SpectralField
@@ -122,14 +123,6 @@ def write_metrics(group: h5py.Group, result: RunResult, grid: h5py.Group) -> Non
         default = ("theta_i",) * np.ndim(value)
         names = METRIC_AXES.get(name, default)
         dataset(group, name, value, METRIC_UNITS.get(name, "1"), [axes[axis] for axis in names])
-
-
-def write_validation(group: h5py.Group, validation: Mapping[str, np.ndarray], grid: h5py.Group) -> None:
-    """Write held-out predictions, a row for each input row in file order."""
-    row = scale(group, "row", np.arange(len(next(iter(validation.values())))), "1")
-    for name, value in validation.items():
-        axes = [row, dataset_of(grid, "wavelength_nm")][: np.ndim(value)]
-        dataset(group, name, value, "1/sr" if np.ndim(value) == 2 else "1", axes)
 
 
 @contextlib.contextmanager

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from sbrdf_jax.folds import LEAVE_ONE_OUT
 from sbrdf_jax.lobes import LOBE_KINDS
 from sbrdf_jax.progress import format_seconds
 from sbrdf_jax.records import STATUS_TEXT, Status
@@ -22,6 +23,15 @@ ERROR_COLUMNS = (
     ("error_lobe", "lobe %", 100.0),
     ("median_relative_error", "median %", 100.0),
     ("delta_e_median", "Delta E", 1.0),
+)
+
+SCORE_COLUMNS = (
+    ("median_rel", "median %", 100.0),
+    ("p90_rel", "90th %", 100.0),
+    ("calm_l2", "calm L2 %", 100.0),
+    ("log_rms", "log RMS", 1.0),
+    ("rel_l2", "L2 %", 100.0),
+    ("negative_share", "negative %", 100.0),
 )
 
 
@@ -38,7 +48,8 @@ class Table:
 
 def summary_text(result: RunResult) -> str:
     """Return the whole summary as plain text."""
-    tables = [input_table(result), done_table(result), error_table(result), time_table(result)]
+    tables = [input_table(result), done_table(result), error_table(result), validation_table(result)]
+    tables.append(time_table(result))
     parts = [table_text(table) for table in tables if table.rows]
     if result.warnings:
         parts.append("Warnings\n" + "\n".join(f"  {warning}" for warning in result.warnings))
@@ -159,6 +170,28 @@ def error_table(result: RunResult) -> Table:
     note = "* no sample at this incident angle: extrapolated" if any("*" in row[0] for row in rows) else ""
     header = ("theta_i [deg]", *(title for _, title, _ in columns))
     return Table("Errors of the compact form against the grid, per incident angle", header, tuple(rows), note, True)
+
+
+def validation_table(result: RunResult) -> Table:
+    """Scores of held-out predictions, over everything and by half angle, for each way of holding out."""
+    rows = []
+    for group, name in (("", "folds, {} fits"), (f"{LEAVE_ONE_OUT}/", "one theta_i out, {} fits")):
+        if f"{group}scores/count" not in result.validation:
+            continue
+        num_fits = len(result.validation[f"{group}status"])
+        rows.append((name.format(num_fits), *_score_cells(result.validation, f"{group}scores")))
+        lower, upper = (result.validation[f"{group}half_angle/{edge}_deg"] for edge in ("lower", "upper"))
+        for k in range(len(lower)):
+            cells = _score_cells(result.validation, f"{group}half_angle", k)
+            rows.append((f"  half angle {lower[k]:g} to {upper[k]:g} deg", *cells))
+    header = ("held out", "samples", *(title for _, title, _ in SCORE_COLUMNS))
+    note = "median and 90th: of |error| / value above 1e-3; calm L2: without the 5 % of rows of most energy"
+    return Table("Held-out predictions", header, tuple(rows), note, True)
+
+
+def _score_cells(validation: Mapping[str, np.ndarray], group: str, index: int | tuple = ()) -> list[str]:
+    values = [(float(np.asarray(validation[f"{group}/{name}"])[index]), scale) for name, _, scale in SCORE_COLUMNS]
+    return [str(int(validation[f"{group}/count"][index])), *(_number(scale * value) for value, scale in values)]
 
 
 def status_table(result: RunResult) -> Table:

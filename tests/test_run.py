@@ -19,6 +19,7 @@ from sbrdf_jax.formats import write_samples
 
 SMALL_GRID = ["grid.theta_i_step_deg=30", "grid.theta_o_step_deg=22.5", "grid.phi_o_step_deg=45"]
 FAST = [*SMALL_GRID, "represent.max_degree=1", "represent.lobe=angle_squared", "output.report=false"]
+HELD_OUT = ["validate.folds=2", "validate.leave_one_theta_i_out=true"]
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def folder(tmp_path_factory):
 
 
 def command(folder, *overrides: str, output: str = "out.h5") -> list[str]:
-    return ["run", str(folder / "config.yaml"), *FAST, f"output.path={folder / output}", *overrides]
+    return ["run", str(folder / "config.yaml"), *FAST, *HELD_OUT, f"output.path={folder / output}", *overrides]
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +61,11 @@ def test_result_holds_what_the_contract_names(result_path):
         assert file["metrics/relative_error_between_theta_i"].shape == (3,)
         for name in ("compression_ratio", "compression_ratio_paper", "negative_share", "negative_depth"):
             assert file[f"metrics/{name}"].shape == (), name
-        assert "plan" in file and "timing" in file
+        for group in ("validation", "validation/leave_one_theta_i_out"):
+            assert file[f"{group}/predicted"].shape == (240, 9) and file[f"{group}/fold"].shape == (240,)
+            assert np.isfinite(file[f"{group}/predicted"][()]).all() and (file[f"{group}/status"][()] == 0).all()
+            assert 0 < file[f"{group}/scores/median_rel"][()] < 1
+        assert "plan" in file and "timing/validate" in file
 
         def check(_name, item):
             if isinstance(item, h5py.Dataset):
@@ -93,7 +98,8 @@ def test_a_second_measurement_of_equal_geometry_compiles_nothing(folder, result_
 
 def test_plan_computes_nothing(folder, capsys):
     assert main([*command(folder, output="planned.h5"), "--plan"]) == 0
-    assert "wavelengths" in capsys.readouterr().out
+    planned = capsys.readouterr().out
+    assert "wavelengths" in planned and "leave_one_theta_i_out" in planned
     assert not (folder / "planned.h5").exists() and not (folder / "planned.h5.log").exists()
 
 
@@ -172,7 +178,9 @@ WRONG_COMMANDS = {
     "output is a folder": (["{config}", "output.path={folder}"], "folder"),
     "output below a file": (["{config}", "output.path={config}/x.h5"], "file"),
     "unknown builtin": (["{config}", "input.path=builtin:green_glass"], "green_glass"),
-    "not built yet": (["{config}", "validate.folds=5"], "not available yet"),
+    "not built yet": (["{config}", "runtime.resume_from=old.h5"], "not available yet"),
+    "missing fold file": (["{config}", "validate.fold_file=absent.csv"], "absent.csv"),
+    "more folds than directions": (["{config}", "validate.folds=1000"], "validate.folds: found 1000"),
     "unknown flag": (["{config}", "--fast"], "--fast"),
 }
 

@@ -14,6 +14,7 @@ EXAMPLE = """example:
   sbrdf run configs/quickstart.yaml output.path=results/mine.h5 represent.max_degree=1
 
 key.path=value is read as YAML; a mapping replaces the whole block. --plan only counts the work.
+validate.folds=5 also predicts every sample by a fit that did not see it, and prints the scores.
 Exit codes: 0 done, 2 config or input wrong, 3 some lanes did not reach their tolerance (listed)."""
 
 
