@@ -14,6 +14,7 @@ from sbrdf_jax.records import GriddedBRDF, RawSamples, SpectralField
 from sbrdf_jax.report import curves, hemisphere, quality
 from sbrdf_jax.report.fine_grid import finite_wavelengths, interpolate_finely, pick_incidences, ring_effect
 from sbrdf_jax.report.lobe_fits import fit_lobe_kinds
+from sbrdf_jax.report.predictions import held_out, schemes_of
 from sbrdf_jax.report.style import save_figure, style_context
 from sbrdf_jax.store import RunResult
 from sbrdf_jax.summary import cleaning_counts
@@ -71,6 +72,8 @@ def _sketches(result: RunResult, samples: RawSamples | None) -> Iterator[_Sketch
         yield _spectra(result, result.field)
     if "relative_error" in result.metrics:
         yield _errors(result)
+    if schemes_of(result.validation):
+        yield _held_out(result, samples)
     yield from _of_samples(result, samples)
     yield from _of_physics_and_solver(result)
 
@@ -140,6 +143,16 @@ def _errors(result: RunResult) -> _Sketch:
         "Errors of the compact form",
         "Eq. 18 at every incident angle, at the nodes and at the midpoints between them, and what it is made of. "
         "Squares of the parts add up to that of the whole, but for cross terms.",
+    )
+
+
+def _held_out(result: RunResult, samples: RawSamples | None) -> _Sketch:
+    return _Sketch(
+        "held_out",
+        held_out(result.validation, samples),
+        "Held-out predictions",
+        "Each value was predicted by a fit that did not see its fold. Relative errors are of values above 1e-3 1/sr "
+        "(dotted); what lies below an axis is drawn at its edge.",
     )
 
 

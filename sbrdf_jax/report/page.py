@@ -14,7 +14,16 @@ from sbrdf_jax.formats import read
 from sbrdf_jax.records import RawSamples
 from sbrdf_jax.report.figures import Drawing, draw
 from sbrdf_jax.store import RunResult
-from sbrdf_jax.summary import Table, cleaning_table, done_table, error_table, input_table, status_table, time_table
+from sbrdf_jax.summary import (
+    Table,
+    cleaning_table,
+    done_table,
+    error_table,
+    input_table,
+    status_table,
+    time_table,
+    validation_table,
+)
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1f2328; --muted: #59636e; --line: #d7dbe0; --page: #f6f7f9; --card: #ffffff;
@@ -110,7 +119,7 @@ def section(name: str, result: RunResult, drawings: Sequence[Drawing], missing: 
     made = " · ".join(html.escape(text) for text in (result.created_utc, version_text(result)) if text)
     warnings = [*result.warnings, *(warning for drawing in drawings for warning in drawing.warnings)]
     tables = "".join(table_html(table) for table in (input_table(result), done_table(result)) if table.rows)
-    wide = (error_table(result), cleaning_table(result))
+    wide = (error_table(result), validation_table(result), cleaning_table(result))
     tables += "".join(table_html(table, wide=True) for table in wide if table.rows)
     tables += "".join(table_html(table) for table in (status_table(result), time_table(result)) if table.rows)
     figures = "".join(figure_html(drawing) for drawing in drawings)
