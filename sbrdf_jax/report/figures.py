@@ -152,7 +152,7 @@ def _held_out(result: RunResult, samples: RawSamples | None) -> _Sketch:
         held_out(result.validation, samples),
         "Held-out predictions",
         "Each value was predicted by a fit that did not see its fold. Relative errors are of values above 1e-3 1/sr "
-        "(dotted); what lies below an axis is drawn at its edge.",
+        "(dotted), the median with a bar up to the 90th percentile; what lies below an axis is drawn at its edge.",
     )
 
 

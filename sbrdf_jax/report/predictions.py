@@ -70,7 +70,7 @@ def _density(figure: Any, axes: Any, measured: np.ndarray, predicted: np.ndarray
     axes.set_xlabel("measured [1/sr]")
     axes.set_ylabel("predicted [1/sr]")
     axes.set_title(title)
-    figure.colorbar(mesh, ax=axes, label="values per bin", shrink=0.85)
+    figure.colorbar(mesh, ax=axes, label="values per bin", shrink=0.8)
 
 
 def _by_half_angle(axes: Any, validation: Mapping[str, np.ndarray], schemes: list) -> None:
@@ -87,11 +87,13 @@ def _by_half_angle(axes: Any, validation: Mapping[str, np.ndarray], schemes: lis
         axes.plot(place, median, color=color, linestyle=line, marker=marker, markersize=5, label=label)
         axes.plot(place, high, color=color, marker="_", markersize=9, linewidth=0)
     axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    axes.set_ylim(low / MARGIN, high * MARGIN)
     for formatted in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
         formatted(lambda value, _position: f"{value:g}" if f"{value:.0e}"[0] in "125" else "")
     axes.set_box_aspect(1)
     axes.set_xticks(range(len(names)), names, fontsize=9)
     axes.set_xlabel("half angle $\\theta_h$ [deg], number of samples")
     axes.set_ylabel("relative error [%]")
-    axes.set_title("Median, and up to the 90th percentile")
+    axes.set_title("Error by half angle")
     axes.legend(loc="best", fontsize=9)
