@@ -1,8 +1,10 @@
 """Batched non-negative least squares with a certificate; knows nothing of BRDFs.
 
 Every lane (column) minimises |A x - b|^2 over x >= 0 with the same A. A problem is given
-by its normal equations: an operator that multiplies by A'A, and A'b. Two methods answer
-to the same call; whatever they report, `kkt_residual` proves the answer.
+by its normal equations: an operator that multiplies by A'A, and A'b. The solver is a
+projected Newton method: conjugate gradients on the unknowns that are free, then a step
+back over the bound, until the free set is right; accelerated projected gradients finish
+the lanes where that fails. Whatever a method reports, `kkt_residual` proves the answer.
 """
 
 import dataclasses
@@ -20,6 +22,9 @@ from sbrdf_jax.records import Status, pytree
 ROUND_STEPS = 100  # steps between two looks from the host
 POWER_STEPS = 50
 LIPSCHITZ_MARGIN = 1.03  # the power iteration approaches the largest eigenvalue from below
+FACE_ACCURACY = 0.3  # conjugate gradients stop where the free unknowns' gradient is this share of the bound's violation
+FACE_STEPS = 1_000  # conjugate gradients on one set of free unknowns, at most
+MAX_STRIKES = 5  # faces that did not lower the objective, before the accelerated gradient takes over
 
 
 @runtime_checkable
@@ -60,12 +65,14 @@ class DenseNormal:
 
 
 @dataclasses.dataclass(frozen=True)
-class AcceleratedProjectedGradient:
-    """Nesterov's projected gradient on the diagonally scaled problem, restarted lane by lane.
+class ProjectedNewton:
+    """Projected Newton with conjugate gradients on the diagonally scaled problem, safeguarded.
 
-    A lane's momentum restarts where its step opposes the move (O'Donoghue and Candes,
-    2015), and a lane stops at its own relative KKT residual, so that its answer does not
-    depend on its neighbours.
+    On the unknowns that are free (positive, or pulled off the bound by their gradient) the
+    quadratic is minimised as far as the bounds' violation deserves, the point is projected
+    on x >= 0, and the free set is taken anew (Bertsekas, 1982). A lane whose objective stops
+    falling goes on by accelerated projected gradients, which always converge. A lane
+    stops at its own relative KKT residual, so that its answer does not depend on its neighbours.
     """
 
     tolerance: float = 1e-8
@@ -125,6 +132,118 @@ def largest_eigenvalue(operator: NormalOperator, scale: Float[Array, " unknown"]
     return jnp.where(norm > 0, norm, 1.0) * LIPSCHITZ_MARGIN
 
 
+class NewtonState(NamedTuple):
+    """A point of every lane in the scaled unknowns, and how it moves next.
+
+    Along conjugate directions the point may pass the bound; a lane that is `returning`
+    takes a full step back to it.
+    """
+
+    point: Float[Array, "unknown lane"]
+    gradient: Float[Array, "unknown lane"]
+    direction: Float[Array, "unknown lane"]
+    free: Bool[Array, "unknown lane"]
+    returning: Bool[Array, " lane"]
+    descent: Float[Array, " lane"]  # squared length of the free gradient
+    lowest: Float[Array, " lane"]  # objective
+    residual: Float[Array, " lane"]
+    strikes: Int[Array, " lane"]
+    face_steps: Int[Array, " lane"]
+    num_steps: Int[Array, " lane"]
+
+
+def begin_newton(
+    operator: NormalOperator, rhs: Float[Array, "unknown lane"], start: Float[Array, "unknown lane"]
+) -> NewtonState:
+    """Return the state before the first step from a non-negative start (unscaled)."""
+    scale = scale_of(operator)[:, None]
+    target, point = rhs / scale, start * scale
+    gradient = operator.multiply(start) / scale - target
+    free = (point > 0) | (gradient < 0)
+    direction = jnp.where(free, -gradient, 0.0)
+    count = jnp.zeros(rhs.shape[1], jnp.int32)
+    return NewtonState(
+        point=point,
+        gradient=gradient,
+        direction=direction,
+        free=free,
+        returning=jnp.zeros(rhs.shape[1], bool),
+        descent=jnp.sum(direction**2, axis=0),
+        lowest=_objective(point, gradient, target),
+        residual=_residual(point, gradient, target),
+        strikes=count,
+        face_steps=count,
+        num_steps=count,
+    )
+
+
+def is_moving(state: NewtonState, tolerance: Float[Array, ""], last_step: Int[Array, ""]) -> Bool[Array, " lane"]:
+    """Lanes that have neither converged nor been given up nor used their steps."""
+    return (state.residual > tolerance) & (state.strikes <= MAX_STRIKES) & (state.num_steps < last_step)
+
+
+def advance_newton(
+    operator: NormalOperator,
+    rhs: Float[Array, "unknown lane"],
+    state: NewtonState,
+    tolerance: Float[Array, ""],
+    last_step: Int[Array, ""],
+) -> NewtonState:
+    """Take steps, one product each, until no lane moves; a lane that has converged stands still."""
+    scale = scale_of(operator)[:, None]
+    target = rhs / scale
+    size = jnp.max(jnp.abs(target), axis=0)
+    face_limit = min(FACE_STEPS, 4 * rhs.shape[0] + 20)
+
+    def take_step(state: NewtonState) -> NewtonState:
+        moving = is_moving(state, tolerance, last_step)
+        image = operator.multiply(state.direction / scale) / scale
+        curvature = jnp.sum(state.direction * image, axis=0)
+        curved = curvature > 0
+        length = jnp.where(curved, state.descent / jnp.where(curved, curvature, 1.0), 0.0)
+        length = jnp.where(moving, jnp.where(state.returning, 1.0, length), 0.0)[None, :]
+        point = state.point + length * state.direction
+        point = jnp.where(state.returning[None, :], jnp.maximum(point, 0.0), point)  # a sum may miss 0 by rounding
+        gradient = state.gradient + length * image
+
+        inside = jnp.max(jnp.where(state.free, jnp.abs(gradient), 0.0), axis=0)
+        below = jnp.max(jnp.where(state.free, -point, 0.0), axis=0)
+        pulled = jnp.max(jnp.where(state.free, 0.0, -gradient), axis=0)
+        residual = jnp.where(below > 0, jnp.inf, jnp.maximum(inside, pulled) / size)
+        done = residual <= tolerance
+
+        value = _objective(point, gradient, target)
+        arrived = moving & state.returning
+        face_steps = state.face_steps + 1
+        stuck = ~state.returning & (~curved | (face_steps >= face_limit))
+        good_enough = (inside <= FACE_ACCURACY * jnp.maximum(below, pulled)) | (inside <= 0.5 * tolerance * size)
+        stop = moving & ~state.returning & (good_enough | stuck)
+        returning = stop & (below > 0)
+        anew = arrived | (stop & (below <= 0))
+        free = jnp.where(anew[None, :], (point > 0) | (gradient < 0), state.free)
+        descent_direction = jnp.where(free, -gradient, 0.0)
+        descent = jnp.sum(descent_direction**2, axis=0)
+        weight = jnp.where(anew | (state.descent == 0), 0.0, descent / jnp.where(state.descent > 0, state.descent, 1.0))
+        direction = descent_direction + weight[None, :] * state.direction
+        direction = jnp.where(returning[None, :], jnp.maximum(point, 0.0) - point, direction)
+        strike = (arrived & ~(value < state.lowest)) | (moving & stuck)
+        return NewtonState(
+            point=point,
+            gradient=gradient,
+            direction=direction,
+            free=free,
+            returning=returning,
+            descent=descent,
+            lowest=jnp.where(arrived, jnp.minimum(value, state.lowest), state.lowest),
+            residual=jnp.where(moving, residual, state.residual),
+            strikes=state.strikes + (strike & ~done).astype(jnp.int32),
+            face_steps=jnp.where(anew | returning, 0, face_steps),
+            num_steps=state.num_steps + moving.astype(jnp.int32),
+        )
+
+    return jax.lax.while_loop(lambda s: jnp.any(is_moving(s, tolerance, last_step)), take_step, state)
+
+
 class ProjectedGradientState(NamedTuple):
     """Iterate and momentum point of every lane, in the scaled unknowns, with their images under the matrix."""
 
@@ -135,30 +254,30 @@ class ProjectedGradientState(NamedTuple):
     momentum: Float[Array, " lane"]
     residual: Float[Array, " lane"]
     num_steps: Int[Array, " lane"]
-    step: Int[Array, ""]
 
 
-def start_state(
-    operator: NormalOperator, rhs: Float[Array, "unknown lane"], start: Float[Array, "unknown lane"]
+def begin_gradient(
+    operator: NormalOperator,
+    rhs: Float[Array, "unknown lane"],
+    start: Float[Array, "unknown lane"],
+    num_steps: Int[Array, " lane"],
 ) -> ProjectedGradientState:
-    """Return the state before the first step from a non-negative start (unscaled)."""
+    """Return the state before the first step from a non-negative start (unscaled), with the steps taken before."""
     scale = scale_of(operator)[:, None]
     iterate = start * scale
     image = operator.multiply(start) / scale
-    lanes = rhs.shape[1]
     return ProjectedGradientState(
         iterate=iterate,
         image=image,
         point=iterate,
         point_image=image,
-        momentum=jnp.ones(lanes, rhs.dtype),
-        residual=_residual(iterate, image, rhs / scale),
-        num_steps=jnp.zeros(lanes, jnp.int32),
-        step=jnp.zeros((), jnp.int32),
+        momentum=jnp.ones(rhs.shape[1], rhs.dtype),
+        residual=_residual(iterate, image - rhs / scale, rhs / scale),
+        num_steps=num_steps,
     )
 
 
-def advance(
+def advance_gradient(
     operator: NormalOperator,
     rhs: Float[Array, "unknown lane"],
     state: ProjectedGradientState,
@@ -166,15 +285,18 @@ def advance(
     tolerance: Float[Array, ""],
     last_step: Int[Array, ""],
 ) -> ProjectedGradientState:
-    """Take steps until every lane has converged or `last_step` is reached; lanes that have converged stand still."""
+    """Take Nesterov's steps until every lane has converged or used its steps.
+
+    A lane's momentum restarts where its step opposes the move (O'Donoghue and Candes, 2015).
+    """
     scale = scale_of(operator)[:, None]
     target = rhs / scale
 
-    def wanted(state: ProjectedGradientState) -> Bool[Array, ""]:
-        return (state.step < last_step) & jnp.any(state.residual > tolerance)
+    def is_active(state: ProjectedGradientState) -> Bool[Array, " lane"]:
+        return (state.residual > tolerance) & (state.num_steps < last_step)
 
     def take_step(state: ProjectedGradientState) -> ProjectedGradientState:
-        active = (state.residual > tolerance)[None, :]
+        active = is_active(state)[None, :]
         iterate = jnp.maximum(state.point - (state.point_image - target) / lipschitz, 0.0)
         iterate = jnp.where(active, iterate, state.iterate)
         image = operator.multiply(iterate / scale) / scale
@@ -189,33 +311,40 @@ def advance(
             point=iterate + weight * move,
             point_image=image + weight * (image - state.image),
             momentum=momentum,
-            residual=jnp.where(active[0], _residual(iterate, image, target), state.residual),
+            residual=jnp.where(active[0], _residual(iterate, image - target, target), state.residual),
             num_steps=state.num_steps + active[0].astype(jnp.int32),
-            step=state.step + 1,
         )
 
-    return jax.lax.while_loop(wanted, take_step, state)
+    return jax.lax.while_loop(lambda s: jnp.any(is_active(s)), take_step, state)
+
+
+def _objective(
+    point: Float[Array, "unknown lane"], gradient: Float[Array, "unknown lane"], target: Float[Array, "unknown lane"]
+) -> Float[Array, " lane"]:
+    return 0.5 * jnp.sum(point * (gradient - target), axis=0)
 
 
 def _residual(
-    iterate: Float[Array, "unknown lane"], image: Float[Array, "unknown lane"], target: Float[Array, "unknown lane"]
+    iterate: Float[Array, "unknown lane"], gradient: Float[Array, "unknown lane"], target: Float[Array, "unknown lane"]
 ) -> Float[Array, " lane"]:
     size = jnp.max(jnp.abs(target), axis=0)
-    worst = jnp.max(jnp.abs(projected_gradient(iterate, image - target)), axis=0)
+    worst = jnp.max(jnp.abs(projected_gradient(iterate, gradient)), axis=0)
     return jnp.where(worst == 0, 0.0, worst / size)
 
 
 def solve_nnls(
     operator: NormalOperator,
     rhs: Float[Array, "unknown lane"],
-    method: AcceleratedProjectedGradient | JaxoptProjectedGradient | None = None,
+    method: ProjectedNewton | JaxoptProjectedGradient | None = None,
+    start: Float[Array, "unknown lane"] | None = None,
 ) -> NNLSResult:
     """Minimise |A x - b|^2 over x >= 0 for every lane; may be used under `jit`, `vmap` and `grad`.
 
     Args:
         operator: A'A, shared by all lanes.
         rhs: A'b, a column per lane.
-        method: `AcceleratedProjectedGradient` (the default) or `JaxoptProjectedGradient`.
+        method: `ProjectedNewton` (the default) or `JaxoptProjectedGradient`.
+        start: Where to start, non-negative; 0 unless given. Not used by jaxopt's method.
 
     Returns:
         Value, status, steps and relative KKT residual of every lane. A lane whose A'b is
@@ -225,27 +354,50 @@ def solve_nnls(
         The derivative is that of the solution, by the implicit function theorem on the
         unknowns that are not at their bound (conjugate gradients), not that of the steps.
     """
-    method = AcceleratedProjectedGradient() if method is None else method
-    finite = jnp.all(jnp.isfinite(rhs), axis=0)
-    value, num_steps = _solution(operator, jnp.where(finite[None, :], rhs, 0.0), method)
+    method = ProjectedNewton() if method is None else method
+    finite, safe = _finite_part(rhs)
+    value, num_steps = _solution(operator, safe, _feasible(start, safe), method)
     residual = jnp.where(finite, kkt_residual(operator, rhs, value), jnp.nan)
     return _judged(value, num_steps, residual, method.tolerance)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _solution(operator, rhs, method):
+def _finite_part(rhs):
+    finite = jnp.all(jnp.isfinite(rhs), axis=0)
+    return finite, jnp.where(finite[None, :], rhs, 0.0)
+
+
+def _feasible(start, rhs):
+    if start is None:
+        return jnp.zeros_like(rhs)
+    return jax.lax.stop_gradient(jnp.where(jnp.isfinite(start), jnp.maximum(start, 0.0), 0.0))
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _solution(operator, rhs, start, method):
     scale = scale_of(operator)
-    lipschitz = largest_eigenvalue(operator, scale)
     if isinstance(method, JaxoptProjectedGradient):
-        return _jaxopt_solution(operator, rhs, scale, lipschitz, method)
-    state = start_state(operator, rhs, jnp.zeros_like(rhs))
-    last_step = jnp.asarray(method.max_steps, jnp.int32)
-    state = advance(operator, rhs, state, lipschitz, jnp.asarray(method.tolerance, rhs.dtype), last_step)
+        return _jaxopt_solution(operator, rhs, scale, largest_eigenvalue(operator, scale), method)
+    tolerance, last_step = jnp.asarray(method.tolerance, rhs.dtype), jnp.asarray(method.max_steps, jnp.int32)
+    newton = advance_newton(operator, rhs, begin_newton(operator, rhs, start), tolerance, last_step)
+    state, lipschitz = _hand_over(operator, rhs, newton, tolerance)
+    state = advance_gradient(operator, rhs, state, lipschitz, tolerance, last_step)
     return state.iterate / scale[:, None], state.num_steps
 
 
-def _solution_forward(operator, rhs, method):
-    value, num_steps = _solution(operator, rhs, method)
+def _hand_over(operator, rhs, newton, tolerance):
+    """Judge the Newton point by a fresh product; what it lacks is left to the accelerated gradient."""
+    scale = scale_of(operator)
+    state = begin_gradient(operator, rhs, jnp.maximum(newton.point, 0.0) / scale[:, None], newton.num_steps)
+    lipschitz = jax.lax.cond(
+        jnp.all(state.residual <= tolerance),
+        lambda: jnp.ones((), rhs.dtype),
+        lambda: largest_eigenvalue(operator, scale),
+    )
+    return state, lipschitz
+
+
+def _solution_forward(operator, rhs, start, method):
+    value, num_steps = _solution(operator, rhs, start, method)
     return (value, num_steps), (operator, value)
 
 
@@ -261,7 +413,7 @@ def _solution_backward(method, saved, cotangent):
     adjoint, _ = jax.scipy.sparse.linalg.cg(restricted, free * cotangent[0] / scale, tol=1e-13, maxiter=10_000)
     adjoint = free * adjoint / scale
     _, pull = jax.vjp(lambda op: op.multiply(value), operator)
-    return pull(-adjoint)[0], adjoint
+    return pull(-adjoint)[0], adjoint, jnp.zeros_like(value)
 
 
 _solution.defvjp(_solution_forward, _solution_backward)
@@ -296,8 +448,9 @@ def _jaxopt_solution(operator, rhs, scale, lipschitz, method):
 def solve_in_rounds(
     operator: NormalOperator,
     rhs: Float[Array, "unknown lane"],
-    method: AcceleratedProjectedGradient,
+    method: ProjectedNewton,
     report: Callable[[int, int], None] | None = None,
+    start: Float[Array, "unknown lane"] | None = None,
 ) -> NNLSResult:
     """`solve_nnls` driven from the host: tells how many lanes have converged as it goes.
 
@@ -308,34 +461,46 @@ def solve_in_rounds(
         rhs: A'b, a column per lane.
         method: Tolerance and step limit.
         report: Called after each round with the number of lanes done and of all lanes.
+        start: Where to start, non-negative; 0 unless given.
     """
     rhs = jnp.asarray(rhs)
-    finite = np.isfinite(np.asarray(rhs)).all(axis=0)
     tolerance = jnp.asarray(method.tolerance, rhs.dtype)
-    state, lipschitz, safe = _begin(operator, rhs)
-    for last_step in range(ROUND_STEPS, method.max_steps + ROUND_STEPS, ROUND_STEPS):
-        limit = jnp.asarray(min(last_step, method.max_steps), jnp.int32)
-        state = _round(operator, safe, state, lipschitz, tolerance, limit)
+    state, safe = _begin(operator, rhs, start)
+    limits = [min(n + ROUND_STEPS, method.max_steps) for n in range(0, method.max_steps, ROUND_STEPS)]
+
+    def tell(state) -> np.ndarray:
         done = np.asarray(state.residual <= tolerance)
         if report is not None:
             report(int(done.sum()), len(done))
-        if np.all(done | ~np.asarray(state.residual > tolerance)):
+        return done
+
+    for limit in limits:
+        state = _newton_round(operator, safe, state, tolerance, jnp.asarray(limit, jnp.int32))
+        if not np.any(is_moving(state, tolerance, jnp.asarray(method.max_steps, jnp.int32))):
             break
-    return _end(operator, rhs, state, jnp.asarray(finite), tolerance)
+        tell(state)
+    state, lipschitz = _checked(operator, safe, state, tolerance)
+    for limit in limits:
+        if np.all(tell(state)):
+            break
+        state = _gradient_round(operator, safe, state, lipschitz, tolerance, jnp.asarray(limit, jnp.int32))
+    return _end(operator, rhs, state, tolerance)
 
 
 @jax.jit
-def _begin(operator, rhs):
-    safe = jnp.where(jnp.all(jnp.isfinite(rhs), axis=0, keepdims=True), rhs, 0.0)
-    state = start_state(operator, safe, jnp.zeros_like(safe))
-    return state, largest_eigenvalue(operator, scale_of(operator)), safe
+def _begin(operator, rhs, start):
+    _, safe = _finite_part(rhs)
+    return begin_newton(operator, safe, _feasible(start, safe)), safe
 
 
-_round = jax.jit(advance)
+_newton_round = jax.jit(advance_newton)
+_gradient_round = jax.jit(advance_gradient)
+_checked = jax.jit(_hand_over)
 
 
 @jax.jit
-def _end(operator, rhs, state, finite, tolerance):
+def _end(operator, rhs, state, tolerance):
+    finite, _ = _finite_part(rhs)
     value = state.iterate / scale_of(operator)[:, None]
     residual = jnp.where(finite, kkt_residual(operator, rhs, value), jnp.nan)
     return _judged(value, state.num_steps, residual, tolerance)

@@ -4,13 +4,15 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from sbrdf_jax.grid import Grid
-from sbrdf_jax.nnls import AcceleratedProjectedGradient, solve_in_rounds
+from sbrdf_jax.multipliers import InverseNormal, invert_normal, start_from_multipliers
+from sbrdf_jax.nnls import NNLSResult, ProjectedNewton, scale_of, solve_in_rounds
 from sbrdf_jax.options import ResampleOptions
 from sbrdf_jax.records import GriddedBRDF, RawSamples
 from sbrdf_jax.resampling.extrapolation import extrapolated_nodes
-from sbrdf_jax.resampling.normal import normal_equations
+from sbrdf_jax.resampling.normal import TiedGridNormal, normal_equations
 
 
 def resample_paper(
@@ -18,6 +20,7 @@ def resample_paper(
     grid: Grid,
     options: ResampleOptions,
     report: Callable[[int, int], None] | None = None,
+    known: InverseNormal | None = None,
 ) -> GriddedBRDF:
     """Fit the non-negative grid whose sinc interpolation is nearest to the samples.
 
@@ -29,13 +32,15 @@ def resample_paper(
         grid: Nodes and ties.
         options: `smoothness_weight` and `tolerance`, both resolved to numbers.
         report: Called with (wavelengths converged, wavelengths) as the solver goes.
+        known: Inverse of A'A from `multipliers.invert_normal`; it depends on the samples'
+            angles, the grid and the weight, so one serves every material of a geometry.
+            Made here where it is not given.
 
     Returns:
         The grid with its certificate; nowhere negative, one value at each pole.
     """
     operator, rhs = normal_equations(samples, grid, float(options.smoothness_weight))
-    method = AcceleratedProjectedGradient(tolerance=float(options.tolerance))
-    found = solve_in_rounds(operator, rhs, method, report)
+    found = solve_normal(operator, rhs, float(options.tolerance), known or invert_normal(operator), report)
     return GriddedBRDF(
         theta_i=jnp.asarray(grid.theta_i),
         theta_o=jnp.asarray(grid.theta_o),
@@ -51,3 +56,34 @@ def resample_paper(
         bilateral=grid.bilateral,
         interpolate_theta_i=grid.interpolate_theta_i,
     )
+
+
+def solve_normal(
+    operator: TiedGridNormal,
+    rhs: Float[Array, "unknown lane"],
+    tolerance: float,
+    known: InverseNormal | None,
+    report: Callable[[int, int], None] | None = None,
+) -> NNLSResult:
+    """Minimise over the non-negative grids: from the multipliers where A'A has an inverse, then to the certificate.
+
+    Args:
+        operator: A'A of `normal_equations`.
+        rhs: A'b, a column per wavelength.
+        tolerance: Relative KKT residual to reach.
+        known: Inverse of A'A; None where there is none, then the solver starts at 0.
+        report: Called with (wavelengths converged, wavelengths) as the solver goes.
+
+    Returns:
+        The answer; `num_steps` counts the steps of both parts.
+
+    Raises:
+        ValueError: `known` is of another geometry.
+    """
+    if known is None:
+        return solve_in_rounds(operator, rhs, ProjectedNewton(tolerance=tolerance), report)
+    if not np.array_equal(np.asarray(known.scale), np.asarray(scale_of(operator))):
+        raise ValueError("the inverse is not of this normal matrix: angles, grid or smoothness weight differ")
+    start, num_steps = start_from_multipliers(operator, rhs, known, tolerance)
+    found = solve_in_rounds(operator, rhs, ProjectedNewton(tolerance=tolerance), report, start)
+    return found._replace(num_steps=found.num_steps + jnp.asarray(num_steps, found.num_steps.dtype))
