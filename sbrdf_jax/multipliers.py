@@ -8,16 +8,15 @@ a start, as good as rounding allows; `nnls` certifies and finishes it.
 """
 
 import functools
-import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg.lapack
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from sbrdf_jax.nnls import DenseNormal, NormalOperator, advance_newton, begin_newton, scale_of
+from sbrdf_jax.nnls import FACE_ACCURACY, NormalOperator, scale_of
 from sbrdf_jax.records import pytree
 
 MAX_UNKNOWNS = 6_000  # the inverse takes 8 bytes for each pair of unknowns: 290 MB
@@ -29,8 +28,6 @@ SINGLE_PRECISION = 1e-6  # rounds to this or a looser tolerance run in float32
 SEARCH_SPACING = 8  # lanes from one that takes part in the search to the next
 MAX_ROUNDS = 10
 MAX_DUAL_STEPS = 500
-SMALLEST_SIZE = 64  # of a round's problem; others are filled up to a few sizes, so that few programs are compiled
-SMALLEST_BATCH = 8  # lanes of a round, likewise
 LAST_SHARE = 0.5  # of the tolerance, for the multipliers: x moves a little when it is set to 0 at its bound
 
 
@@ -132,7 +129,7 @@ class _Search:
     """Multipliers and values of all lanes (scaled), and the unknowns that may be at their bound."""
 
     def __init__(self, known: InverseNormal, image: np.ndarray, bound: np.ndarray):
-        self.known, self.image, self.bound = known, image, bound
+        self.inverse, self.image, self.bound = np.asarray(known.inverse), image, bound
         self.multiplier = np.zeros(image.shape)
         self.value = image.copy()
         self.num_steps = np.zeros(image.shape[1], int)
@@ -140,35 +137,88 @@ class _Search:
     def run(self, lanes: np.ndarray, tolerance: float) -> np.ndarray:
         """Solve some lanes on the present set, then correct it; return those that it was too small for."""
         index = np.flatnonzero(self.bound)
-        size = min(_next_size(len(index), SMALLEST_SIZE), len(self.bound))
-        batch = min(_next_size(len(lanes), SMALLEST_BATCH), self.image.shape[1])
-        place = np.concatenate([index, np.zeros(size - len(index), int)])
-        spare = ((0, 0), (0, batch - len(lanes)))
-        found, value, negative, steps = jax.device_get(
-            _solve_multipliers(
-                self.known,
-                np.pad(self.image[:, lanes], spare),
-                place,
-                np.arange(size) < len(index),
-                np.pad(self.multiplier[np.ix_(place, lanes)], spare),
-                np.asarray(tolerance),
-                dtype="float32" if tolerance >= SINGLE_PRECISION else "float64",
-            )
-        )
-        found, negative = found[: len(index), : len(lanes)], negative[:, : len(lanes)]
+        rows = self.inverse[index]
+        dtype = np.float32 if tolerance >= SINGLE_PRECISION else np.float64
+        image, start = self.image[np.ix_(index, lanes)], self.multiplier[np.ix_(index, lanes)]
+        matrix = np.take(rows, index, axis=1).astype(dtype)
+        found, steps = minimise_on_host(matrix, -image.astype(dtype), start.astype(dtype), tolerance)
+        value = self.image[:, lanes] + rows.T @ found.astype(float)
+        negative = value < -0.1 * tolerance
+        negative[index] = False
         self.multiplier[:, lanes] = 0.0
         self.multiplier[np.ix_(index, lanes)] = found
-        self.value[:, lanes] = value[:, : len(lanes)]
-        self.num_steps[lanes] += steps[: len(lanes)]
+        self.value[:, lanes] = value
+        self.num_steps[lanes] += steps
         self.bound = negative.any(axis=1)
         self.bound[index] |= (found > 0).any(axis=1)
         return lanes[negative.any(axis=0)]
 
 
-def _next_size(count: int, smallest: int) -> int:
-    """The next of s, 1.5 s, 2 s, 3 s, 4 s, 6 s, ..."""
-    power = smallest * 2 ** math.ceil(math.log2(max(count, smallest) / smallest))
-    return 3 * power // 4 if count <= 3 * power // 4 and power > smallest else power
+def minimise_on_host(
+    matrix: np.ndarray, rhs: np.ndarray, start: np.ndarray, tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Minimise 1/2 w'M w - w'b over w >= 0 by the steps of `nnls.advance_newton`, in NumPy.
+
+    On the host, because sizes change from round to round, and each would be compiled anew;
+    a lane that has converged leaves the batch.
+
+    Args:
+        matrix: M [unknown, unknown], positive definite.
+        rhs: b [unknown, lane].
+        start: w [unknown, lane].
+        tolerance: Relative KKT residual.
+
+    Returns:
+        w, and the steps of each lane.
+    """
+    answer, num_steps = start.copy(), np.zeros(rhs.shape[1], int)
+    scale = np.sqrt(np.diag(matrix))[:, None]
+    matrix, rhs = matrix / scale / scale.T, rhs / scale
+    size = np.abs(rhs).max(axis=0, initial=0.0)
+    lanes = np.flatnonzero((size > 0) & (rhs > 0).any(axis=0))
+    answer[:, np.setdiff1d(np.arange(rhs.shape[1]), lanes)] = 0.0
+    rhs, size, point = rhs[:, lanes], size[lanes], start[:, lanes] * scale
+    gradient = matrix @ point - rhs
+    free = (point > 0) | (gradient < 0)
+    direction, descent = np.zeros_like(point), np.zeros_like(size)
+    returning = np.zeros(len(lanes), bool)
+    for _ in range(MAX_DUAL_STEPS):
+        inside = np.where(free, gradient, 0)
+        worst = np.abs(inside).max(axis=0, initial=0.0)
+        below = np.maximum(-point.min(axis=0, initial=0.0), 0)
+        pulled = np.maximum(-(gradient - inside).min(axis=0, initial=0.0), 0)
+        done = (below <= 0) & (np.maximum(worst, pulled) <= tolerance * size)
+        if done.any():
+            answer[:, lanes[done]] = point[:, done] / scale
+            keep = ~done
+            lanes, size, worst, below, pulled = (v[keep] for v in (lanes, size, worst, below, pulled))
+            descent, returning = descent[keep], returning[keep]
+            point, gradient, direction, free = (v[:, keep] for v in (point, gradient, direction, free))
+        if not len(lanes):
+            break
+        num_steps[lanes] += 1
+        enough = (worst <= FACE_ACCURACY * np.maximum(below, pulled)) | (worst <= 0.5 * tolerance * size)
+        stop = ~returning & enough
+        anew = returning | (stop & (below <= 0))
+        returning = stop & (below > 0)
+        if anew.any():
+            free[:, anew] = (point[:, anew] > 0) | (gradient[:, anew] < 0)
+        fresh = np.where(free, -gradient, 0)
+        before, descent = descent, np.einsum("ij,ij->j", fresh, fresh)
+        weight = np.where(anew | (before <= 0), 0, descent / np.where(before > 0, before, 1)).astype(point.dtype)
+        direction *= weight
+        direction += fresh
+        if returning.any():
+            direction[:, returning] = np.maximum(point[:, returning], 0) - point[:, returning]
+        image = matrix @ direction
+        curvature = np.einsum("ij,ij->j", direction, image)
+        length = np.where(returning, 1, descent / np.where(curvature > 0, curvature, np.inf)).astype(point.dtype)
+        point += length * direction
+        gradient += length * image
+        if returning.any():
+            point[:, returning] = np.maximum(point[:, returning], 0)
+    answer[:, lanes] = np.maximum(point, 0) / scale
+    return answer, num_steps
 
 
 @jax.jit
@@ -181,26 +231,3 @@ def _unconstrained(operator, rhs, known: InverseNormal):
     clipped = jnp.maximum(image, 0.0)
     gradient = operator.multiply(clipped / known.scale[:, None]) / known.scale[:, None] - target
     return image, size, (image < 0) & (gradient > 0)
-
-
-@functools.partial(jax.jit, static_argnames="dtype")
-def _solve_multipliers(
-    known: InverseNormal,
-    image: Float[Array, "unknown lane"],
-    place: Int[Array, " bound"],
-    real: Bool[Array, " bound"],
-    start: Float[Array, "bound lane"],
-    tolerance: Float[Array, ""],
-    *,
-    dtype: str,
-):
-    """Minimise 1/2 w'K w + w'K A'b over w >= 0 in the unknowns `place`, those that are `real`."""
-    rows = known.inverse[place] * real[:, None].astype(known.inverse.dtype)
-    matrix = rows[:, place] * real[None, :].astype(rows.dtype) + jnp.diag(1 - real.astype(rows.dtype))
-    operator, rhs = DenseNormal(matrix.astype(dtype)), (-image[place] * real[:, None].astype(rows.dtype)).astype(dtype)
-    state = begin_newton(operator, rhs, (start * real[:, None].astype(rows.dtype)).astype(dtype))
-    state = advance_newton(operator, rhs, state, tolerance.astype(dtype), jnp.asarray(MAX_DUAL_STEPS, jnp.int32))
-    found = (jnp.maximum(state.point, 0.0) / scale_of(operator)[:, None]).astype(rows.dtype)
-    value = image + rows.T @ found
-    inside = jnp.zeros(value.shape[0], bool).at[place].max(real)
-    return found, value, (value < -0.1 * tolerance) & ~inside[:, None], state.num_steps

@@ -6,8 +6,8 @@ import pytest
 import scipy.optimize
 from tolerances import KKT, tolerance
 
-from sbrdf_jax.multipliers import MAX_UNKNOWNS, invert_normal, start_from_multipliers
-from sbrdf_jax.nnls import DenseNormal, ProjectedNewton, kkt_residual, solve_in_rounds
+from sbrdf_jax.multipliers import MAX_UNKNOWNS, invert_normal, minimise_on_host, start_from_multipliers
+from sbrdf_jax.nnls import DenseNormal, ProjectedNewton, kkt_residual, solve_in_rounds, solve_nnls
 from sbrdf_jax.records import Status
 
 
@@ -70,3 +70,11 @@ def test_any_start_leads_to_the_same_answer(rng):
     wild = jnp.asarray(rng.uniform(-1, 1, rhs.shape)).at[0, 0].set(jnp.nan)
     found = solve_in_rounds(operator, rhs, ProjectedNewton(tolerance=1e-11), start=wild)
     np.testing.assert_allclose(found.value, plain.value, rtol=0, atol=1e-7 * float(jnp.max(plain.value)))
+
+
+def test_host_and_jax_take_the_same_steps(rng):
+    operator, rhs = normal(*smooth_problem(rng))
+    by_jax = solve_nnls(operator, rhs, ProjectedNewton(tolerance=1e-10))
+    by_host, steps = minimise_on_host(np.asarray(operator.matrix), np.asarray(rhs), np.zeros(rhs.shape), 1e-10)
+    np.testing.assert_allclose(by_host, by_jax.value, rtol=0, atol=1e-7 * by_host.max())  # 1e-10 times the condition
+    assert (np.abs(steps - np.asarray(by_jax.num_steps)) <= 0.2 * steps + 5).all()

@@ -10,9 +10,9 @@ from tolerances import GRADIENT, LANE, OBJECTIVE, PLANTED, ROUNDING, tolerance
 
 from sbrdf_jax import nnls
 from sbrdf_jax.nnls import (
-    ProjectedNewton,
     DenseNormal,
     JaxoptProjectedGradient,
+    ProjectedNewton,
     kkt_residual,
     solve_in_rounds,
 )
