@@ -23,8 +23,6 @@ NOT_YET: dict[str, tuple[Callable[[Any], bool], str]] = {
         "auto, pbrt, csv, hdf5, nist",
     ),
     "grid.reciprocal": (lambda value: value, "false"),
-    "resample.method": (lambda value: value == "guided", "paper"),
-    "resample.smoothness_weight": (lambda value: value == "data", "auto or a number"),
     "encode.basis": (lambda value: value == "data", "auto, fourier, cosine, identity"),
     "represent.method": (lambda value: value in ("lobe_harmonics", "lobe_tensor"), "auto, paper"),
     "scene": (lambda value: value is not None, "null"),
@@ -242,6 +240,16 @@ def _problems(options: RunOptions) -> Iterator[tuple[str, str]]:
     encode = resolve(options).encode
     if encode.basis == "fourier" and isinstance(encode.coefficients, int) and encode.coefficients % 2 == 0:
         yield "encode.coefficients", f"found {encode.coefficients}; expected an odd number, because basis is fourier"
+    method, weight = options.resample.method, options.resample.smoothness_weight
+    if method == "paper" and weight == "data":
+        yield (
+            "resample.smoothness_weight",
+            "found data, which method paper does not have yet; expected auto or a number",
+        )
+    if method == "guided" and weight == 0:
+        yield "resample.smoothness_weight", "found 0; expected data or a number above 0, because method is guided"
+    if method == "guided" and options.input.bilateral is False:
+        yield "input.bilateral", "found false; expected auto or true, because method guided folds phi_o"
     if options.validate.folds == 1:
         yield "validate.folds", "found 1; expected 0 (off), or 2 or more"
     for key in _ONE_OF:

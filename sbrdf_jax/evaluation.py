@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Real
 from sbrdf_jax.encoding import decode
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, SpectralField
 from sbrdf_jax.representation.paper import compact_coefficient
+from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_direction, standard_error
 from sbrdf_jax.sinc import Window, azimuth_distance, polar_distance, separable_weights
 
 CHUNK_BYTES = 128 * 2**20  # working memory of one chunk of directions
@@ -60,7 +61,7 @@ def evaluate(
     """
     if direction_kernel.dispatch(type(result)) is direction_kernel.dispatch(object):
         raise TypeError(f"{type(result).__name__} cannot be evaluated: no kernel is registered for it")
-    dtype = jnp.asarray(result.theta_i).dtype
+    dtype = jnp.asarray(jax.tree.leaves(result)[0]).dtype
     angles = jnp.broadcast_arrays(*(jnp.asarray(a, dtype) for a in (theta_i, theta_o, phi_o)))
     wavelength = None if wavelength_nm is None else jnp.atleast_1d(jnp.asarray(wavelength_nm, dtype))
     kernel = functools.partial(direction_kernel, result, wavelength_nm=wavelength)
@@ -79,9 +80,20 @@ def direction_kernel(result, theta_i, theta_o, phi_o, *, wavelength_nm=None) -> 
 
 @direction_kernel.register
 def _(result: GriddedBRDF, theta_i, theta_o, phi_o, *, wavelength_nm=None):
-    if result.method != "paper":
-        raise TypeError(f"method {result.method!r} has a field of its own: evaluate that, not its nodes")
-    value = interpolate_nodes(result, jnp.asarray(result.brdf), theta_i, theta_o, phi_o)
+    if result.field is None:
+        value = interpolate_nodes(result, jnp.asarray(result.brdf), theta_i, theta_o, phi_o)
+    else:
+        nodes = jnp.asarray(result.theta_i)
+        angle = theta_i if result.interpolate_theta_i else nodes[nearest(theta_i, nodes)]
+        value = evaluate_direction(result.field, angle, theta_o, phi_o)
+    if wavelength_nm is None:
+        return value
+    return spectral_weights(wavelength_nm, jnp.asarray(result.wavelength_nm)) @ value
+
+
+@direction_kernel.register
+def _(result: GuidedField, theta_i, theta_o, phi_o, *, wavelength_nm=None):
+    value = evaluate_direction(result, theta_i, theta_o, phi_o)
     if wavelength_nm is None:
         return value
     return spectral_weights(wavelength_nm, jnp.asarray(result.wavelength_nm)) @ value
@@ -264,11 +276,45 @@ def evaluate_in_chunks(
 
 def numbers_per_direction(result) -> int:
     """Rough count of the numbers that one direction needs while it is evaluated."""
+    if isinstance(result, GuidedField) or getattr(result, "field", None) is not None:
+        return 2 * 4**3 * len(result.wavelength_nm)  # the nodes around it on two grids
     if isinstance(result, GriddedBRDF):
         return 8 * int(np.prod(result.brdf.shape[1:3])) + 4 * result.brdf.shape[3]
     if isinstance(result, SpectralField):
         return 8 * int(np.prod(result.coefficient.shape[1:3])) + 4 * len(result.basis.wavelength_nm)
     return sum(int(np.prod(np.shape(leaf)[1:])) for leaf in jax.tree.leaves(result)) + 1
+
+
+def evaluate_standard_error(
+    result: Any,
+    theta_i: npt.ArrayLike,
+    theta_o: npt.ArrayLike,
+    phi_o: npt.ArrayLike,
+    wavelength_nm: npt.ArrayLike | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Standard error of the resampled field, and the noise of one measurement there [1/sr], on the host.
+
+    Args:
+        result: A GriddedBRDF with a field of its own, or that field.
+        theta_i: Polar angle of incidence [rad]; the three angles broadcast.
+        theta_o: Polar angle of exitance [rad].
+        phi_o: Azimuth of exitance [rad].
+        wavelength_nm: Linear between the measured wavelengths, which are taken unless given.
+
+    Raises:
+        TypeError: the method has no standard error.
+    """
+    field = getattr(result, "field", result)
+    if not isinstance(field, GuidedField):
+        raise TypeError(f"{type(result).__name__}: its method has no standard error")
+    angles = np.broadcast_arrays(*(np.asarray(a, float) for a in (theta_i, theta_o, phi_o)))
+    found = standard_error(field, *(jnp.asarray(a.reshape(-1)) for a in angles))
+    both = np.asarray(found).reshape(2, *angles[0].shape, -1)
+    if wavelength_nm is not None:
+        measured = np.asarray(field.wavelength_nm)
+        hats = np.stack([np.interp(wavelength_nm, measured, unit) for unit in np.eye(len(measured))])
+        both = both @ hats
+    return both[0], both[1]
 
 
 def evaluate_on_axes(
@@ -283,7 +329,7 @@ def evaluate_on_axes(
     For the grid, eq. (5) is separable: three small products replace one row of weights for
     every direction. Other records are evaluated direction by direction, in chunks.
     """
-    if isinstance(result, GriddedBRDF):
+    if isinstance(result, GriddedBRDF) and result.field is None:
         wavelength = None if wavelength_nm is None else jnp.asarray(wavelength_nm, float)
         axes = (jnp.asarray(a, float) for a in (theta_i, theta_o, phi_o))
         return np.asarray(_grid_on_axes(result, *axes, wavelength))
@@ -293,8 +339,6 @@ def evaluate_on_axes(
 
 @jax.jit
 def _grid_on_axes(grid: GriddedBRDF, theta_i, theta_o, phi_o, wavelength_nm):
-    if grid.method != "paper":
-        raise TypeError(f"method {grid.method!r} has a field of its own: evaluate that, not its nodes")
     zero = jnp.zeros((), jnp.asarray(grid.theta_i).dtype)
     along_i = jax.vmap(lambda t: [term[0] for term in node_weights(grid, t, zero, zero)])(theta_i)
     along_o = jax.vmap(lambda t: [term[1] for term in node_weights(grid, zero, t, zero)])(theta_o)

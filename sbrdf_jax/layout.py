@@ -12,21 +12,28 @@ from sbrdf_jax.coverage import Coverage
 from sbrdf_jax.encoding import coefficient_names, make_basis
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.harmonics import harmonic_orders
-from sbrdf_jax.hdf5 import attribute, dataset, dataset_of, degrees, read, scale
+from sbrdf_jax.hdf5 import attribute, dataset, dataset_of, degrees, read, read_mapping, scale, write_mapping
 from sbrdf_jax.lobes import LOBE_KINDS
 from sbrdf_jax.metrics import stored_numbers
 from sbrdf_jax.records import STATUS_TEXT, CompactBRDF, GriddedBRDF, SpectralBasis, SpectralField, Status
+from sbrdf_jax.resampling.guided.error_model import ResidualScale
+from sbrdf_jax.resampling.guided.field import GuidedField
+from sbrdf_jax.resampling.guided.lobe_model import SHAPE_NAMES, LobeModel
+from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance
+from sbrdf_jax.resampling.guided.smoothing import PRIORS
 from sbrdf_jax.scores import SCORE_TEXT
 
+GUIDED_PARTS = {"lobe": LobeModel, "variance": ModeVariance, "scale": ResidualScale}
 _ANGLES = ("theta_i", "theta_o", "phi_o")
 
 # Axes and units of what validation stores, by the last part of the name; scores and counts have neither.
 VALIDATION_AXES = {
     "predicted": ("row", "wavelength"),
+    "expected_error": ("row", "wavelength"),
     "fold": ("row",),
     "status": ("fit", "wavelength"),
 }
-VALIDATION_UNITS = {"predicted": "1/sr", "lower_deg": "deg", "upper_deg": "deg"}
+VALIDATION_UNITS = {"predicted": "1/sr", "expected_error": "1/sr", "lower_deg": "deg", "upper_deg": "deg"}
 
 
 def write_grid(group: h5py.Group, gridded: GriddedBRDF) -> None:
@@ -44,6 +51,21 @@ def write_grid(group: h5py.Group, gridded: GriddedBRDF) -> None:
     dataset(group, "kkt_residual", gridded.kkt_residual, "1", [axes["wavelength"]])
     dataset(group, "num_steps", np.asarray(gridded.num_steps, np.int64), "1", [axes["wavelength"]])
     status_dataset(group, gridded.status, [axes["wavelength"]])
+    if gridded.standard_error is not None:
+        dataset(group, "standard_error", gridded.standard_error, "1/sr", [*directions, axes["wavelength"]])
+
+
+def write_guided(group: h5py.Group, field: GuidedField) -> None:
+    """Write what evaluates the guided field at any direction."""
+    record = {f.name: getattr(field, f.name) for f in dataclasses.fields(field)}
+    arrays = {name: np.asarray(value) for name, value in record.items() if name not in GUIDED_PARTS}
+    for name in ("theta_limit", "centre"):
+        arrays[f"{name}_deg"] = degrees(arrays.pop(name))
+    parts = {name: {f: np.asarray(v) for f, v in vars(record[name]).items()} for name in GUIDED_PARTS}
+    write_mapping(group, arrays | parts | {"priors": list(PRIORS), "lobe_shape": list(SHAPE_NAMES)}, "1")
+    for name, axes in GRIDS.items():
+        for axis, label in zip(axes, (name, "theta_i", "theta_o"), strict=True):
+            group[name].attrs[f"{label}_nodes"] = axis.nodes
 
 
 def write_field(group: h5py.Group, field: SpectralField, grid: h5py.Group) -> None:
@@ -135,8 +157,18 @@ def status_dataset(group: h5py.Group, status, axes: list[h5py.Dataset]) -> None:
     written.attrs["meaning"] = json.dumps({s.name.lower(): STATUS_TEXT[s] for s in Status})
 
 
-def read_grid(group: h5py.Group) -> GriddedBRDF:
-    """Read the resampled field."""
+def read_guided(group: h5py.Group) -> GuidedField:
+    """Read the guided field."""
+    stored = read_mapping(group)
+    parts = {name: kind(**stored.pop(name)) for name, kind in GUIDED_PARTS.items()}
+    angles = {name: np.deg2rad(stored.pop(f"{name}_deg")) for name in ("theta_limit", "centre")}
+    names = {f.name for f in dataclasses.fields(GuidedField)}
+    plain = {name: np.asarray(value) for name, value in stored.items() if name in names}
+    return GuidedField(**plain, **parts, **angles)
+
+
+def read_grid(group: h5py.Group, field: h5py.Group | None = None) -> GriddedBRDF:
+    """Read the resampled field, with what evaluates it where that is more than the nodes."""
     axes = [read(group, f"{name}_deg") for name in _ANGLES]
     wavelength_nm = read(group, "wavelength_nm")
     directions, lanes = tuple(map(len, axes)), (len(wavelength_nm),)
@@ -154,6 +186,8 @@ def read_grid(group: h5py.Group) -> GriddedBRDF:
         window=str(attribute(group, "window")),
         bilateral=bool(attribute(group, "bilateral")),
         interpolate_theta_i=bool(attribute(group, "interpolate_theta_i")),
+        standard_error=read(group, "standard_error", (*directions, *lanes)) if "standard_error" in group else None,
+        field=None if field is None else read_guided(field),
     )
 
 

@@ -17,6 +17,7 @@ from sbrdf_jax.progress import Progress, StageClock
 from sbrdf_jax.records import STATUS_TEXT, GriddedBRDF, RawSamples, Status
 from sbrdf_jax.representation import represent_with_plan
 from sbrdf_jax.resampling import resample
+from sbrdf_jax.resampling.guided import describe_fit
 from sbrdf_jax.runtime import compile_clock
 from sbrdf_jax.store import RunResult
 from sbrdf_jax.summary import count_statuses
@@ -81,8 +82,9 @@ def process(raw: RawSamples, ready: Prepared, options: RunOptions, progress: Pro
             samples,
             ready.grid,
             options.resample,
-            lambda done, total: progress.update(f"{done} of {total} wavelengths converged"),
+            progress.update,
         )
+    notes = () if gridded.field is None else describe_fit(gridded.field)
 
     live = finite_part(gridded)
     with _timed(progress, timing, "encode"):
@@ -124,7 +126,7 @@ def process(raw: RawSamples, ready: Prepared, options: RunOptions, progress: Pro
             "coefficients_used": used,
         },
         timing=timing,
-        warnings=ready.warnings + metrics.warnings,
+        warnings=ready.warnings + notes + metrics.warnings,
         source_sha256=raw.source_sha256,
     )
 
@@ -136,7 +138,9 @@ def finite_part(gridded: GriddedBRDF) -> GriddedBRDF:
         return gridded
     per_wavelength = ("wavelength_nm", "kkt_residual", "num_steps", "status")
     parts = {name: np.asarray(getattr(gridded, name))[live] for name in per_wavelength}
-    return dataclasses.replace(gridded, brdf=np.asarray(gridded.brdf)[..., live], **parts)
+    return dataclasses.replace(
+        gridded, brdf=np.asarray(gridded.brdf)[..., live], standard_error=None, field=None, **parts
+    )
 
 
 def failed_lanes(result: RunResult) -> list[str]:

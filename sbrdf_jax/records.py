@@ -89,8 +89,9 @@ class GriddedBRDF:
     """The resampled field on the uniform grid, and what proves it.
 
     phi_o runs from 0 to 2 pi inclusive. For method "paper" the nodes are the field: any
-    direction follows from them by eq. (5), under `window`. `interpolate_theta_i` is False
-    where fewer than 3 incident angles were measured: the theta_i axis is then the measured ones.
+    direction follows from them by eq. (5), under `window`; for "guided" they are read off
+    `field`. `interpolate_theta_i` is False where fewer than 3 incident angles were measured:
+    the theta_i axis is then the measured ones.
     """
 
     theta_i: Any  # [theta_i] rad
@@ -106,6 +107,8 @@ class GriddedBRDF:
     window: str = "factor"
     bilateral: bool = False
     interpolate_theta_i: bool = True
+    standard_error: Any = None  # [theta_i, theta_o, phi_o, wavelength] 1/sr, where the method has one
+    field: Any = None  # what evaluates any direction, where that is more than the nodes
 
 
 @pytree(static=("kind", "uniform"))

@@ -53,6 +53,31 @@ def held_out_scores(
     }
 
 
+def coverage(
+    predicted: Float[np.ndarray, "..."], measured: Float[np.ndarray, "..."], expected_error: Float[np.ndarray, "..."]
+) -> float:
+    """Share of the measured values above 1e-3 1/sr that lie within one expected error of their prediction.
+
+    An honest error model covers 68 %.
+    """
+    big = measured > SMALLEST_RELATIVE
+    return float(np.mean((np.abs(predicted - measured) <= expected_error)[big])) if big.any() else float("nan")
+
+
+def coverage_by(
+    label: np.ndarray,
+    predicted: Float[np.ndarray, "row wavelength"],
+    measured: Float[np.ndarray, "row wavelength"],
+    expected_error: Float[np.ndarray, "row wavelength"],
+) -> dict[str, np.ndarray]:
+    """Coverage of each distinct finite label [row, wavelength]: `label`, `share` and `count` of values [bin]."""
+    label = np.where(measured > SMALLEST_RELATIVE, label, np.nan)
+    distinct = np.unique(label[np.isfinite(label)])
+    masks = [label == one for one in distinct]
+    share = [coverage(predicted[mask], measured[mask], expected_error[mask]) for mask in masks]
+    return {"label": distinct, "share": np.array(share), "count": np.array([int(mask.sum()) for mask in masks])}
+
+
 def scores_by_half_angle(
     predicted: Float[np.ndarray, "row wavelength"],
     measured: Float[np.ndarray, "row wavelength"],

@@ -41,6 +41,7 @@ from sbrdf_jax.layout import (
     write_compact,
     write_field,
     write_grid,
+    write_guided,
     write_validation,
 )
 from sbrdf_jax.metrics import METRIC_AXES, METRIC_UNITS
@@ -92,6 +93,8 @@ def write_result(file: h5py.File, result: RunResult) -> None:
     file.attrs["warnings"] = json.dumps(list(result.warnings))
     grid = file.create_group("grid")
     write_grid(grid, result.gridded)
+    if result.gridded.field is not None:
+        write_guided(file.create_group("field"), result.gridded.field)
     if result.field is not None:
         write_field(file.create_group("spectral"), result.field, grid)
     if result.compact is not None:
@@ -158,7 +161,7 @@ def load(path: str | os.PathLike) -> RunResult:
     """
     with open_result(path) as file:
         source = group_of(file, "input")
-        gridded = read_grid(group_of(file, "grid"))
+        gridded = _read_grid(file)
         compact = read_compact(group_of(file, "compact")) if "compact" in file else None
         return RunResult(
             gridded=gridded,
@@ -185,11 +188,14 @@ def load_stage(path: str | os.PathLike, stage: str) -> GriddedBRDF | CompactBRDF
     Raises:
         UserError: as `load`, or the result has no such stage.
     """
-    readers = {"grid": read_grid, "compact": read_compact}
     with open_result(path) as file:
         if stage not in file:
             raise UserError(f"{path}: stage {stage}: not in this result, found {', '.join(file)}")
-        return readers[stage](group_of(file, stage))
+        return _read_grid(file) if stage == "grid" else read_compact(group_of(file, stage))
+
+
+def _read_grid(file: h5py.File) -> GriddedBRDF:
+    return read_grid(group_of(file, "grid"), group_of(file, "field") if "field" in file else None)
 
 
 def describe(path: str | os.PathLike) -> list[str]:

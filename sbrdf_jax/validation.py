@@ -13,13 +13,15 @@ from jaxtyping import Bool, Float, Int
 
 from sbrdf_jax.angles import half_angle
 from sbrdf_jax.cleaning import DROPPED, CleanReport, clean
-from sbrdf_jax.evaluation import evaluate_in_chunks
+from sbrdf_jax.coverage import cluster_incidences
+from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_standard_error
 from sbrdf_jax.folds import LEAVE_ONE_OUT, Folds
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.options import ResampleOptions
 from sbrdf_jax.records import RawSamples
 from sbrdf_jax.resampling import resample
-from sbrdf_jax.scores import held_out_scores, scores_by_half_angle
+from sbrdf_jax.resampling.guided import Centres, fit_field, place_centres
+from sbrdf_jax.scores import coverage, coverage_by, held_out_scores, scores_by_half_angle
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +29,7 @@ class Prediction:
     """What one fit says at the directions that it did not see."""
 
     value: Float[np.ndarray, "direction wavelength"]  # 1/sr
+    expected_error: Float[np.ndarray, "direction wavelength"] | None  # 1/sr, of the field and one measurement together
     status: Int[np.ndarray, " wavelength"]  # Status of the fit
 
 
@@ -35,6 +38,7 @@ class HeldOut:
     """Predictions of all rows, each by a fit that did not see its fold."""
 
     predicted: Float[np.ndarray, "row wavelength"]  # 1/sr; nan where the row is in no fold
+    expected_error: Float[np.ndarray, "row wavelength"] | None  # 1/sr, where the method has one
     fold: Int[np.ndarray, " row"]  # NO_FOLD where the row is in none
     status: Int[np.ndarray, "fold wavelength"]  # Status of each fold's fit, folds in increasing order
 
@@ -46,14 +50,38 @@ def predict(
     theta_i: Float[np.ndarray, " direction"],
     theta_o: Float[np.ndarray, " direction"],
     phi_o: Float[np.ndarray, " direction"],
-    report: Callable[[int, int], None] | None = None,
+    report: Callable[[str], None] | None = None,
+    centres: Centres | None = None,
 ) -> Prediction:
     """Fit cleaned samples and evaluate the fitted field at other directions [rad].
 
     The one place where validation meets a method.
+
+    Args:
+        train: Cleaned samples.
+        grid: The grid of the whole measurement.
+        options: Resolved options.
+        theta_i: Polar angle of incidence [rad].
+        theta_o: Polar angle of exitance [rad].
+        phi_o: Azimuth of exitance [rad].
+        report: Told how far it is.
+        centres: For method guided, what depends on angles alone.
     """
+    angles = theta_i, theta_o, phi_o
+    if options.method == "guided":
+        fit = fit_field(train, options, report, None if centres is None else centres.take(train.row))
+        error, noise = evaluate_standard_error(fit.field, *angles)
+        return Prediction(evaluate_in_chunks(fit.field, *angles), np.hypot(error, noise), fit.status)
     gridded = resample(train, grid, options, report)
-    return Prediction(evaluate_in_chunks(gridded, theta_i, theta_o, phi_o), np.asarray(gridded.status, int))
+    return Prediction(evaluate_in_chunks(gridded, *angles), None, np.asarray(gridded.status, int))
+
+
+def share_angles(raw: RawSamples, options: ResampleOptions, bilateral: bool) -> Centres | None:
+    """Return what fits to parts of a measurement share, because it depends on angles alone; None for method paper."""
+    if options.method != "guided":
+        return None
+    positive = dataclasses.replace(raw, value=np.ones_like(raw.value))  # no row is dropped for its values
+    return place_centres(clean(positive, bilateral=bilateral, method=options.method).samples)
 
 
 def predict_held_out(
@@ -82,21 +110,24 @@ def predict_held_out(
         UserError: The rows outside a fold are not enough for a fit.
     """
     labels = folds.labels
-    predicted = np.full(raw.value.shape, np.nan)
+    predicted, expected = np.full((2, *raw.value.shape), np.nan)
+    centres = share_angles(raw, options, bilateral)
     status = np.zeros((len(labels), len(raw.wavelength_nm)), int)
     top = np.pi / 2  # above it by rounding, as cleaning clips it
     for number, label in enumerate(labels):
 
-        def say(done: int, total: int, place: str = f"fold {number + 1} of {len(labels)}") -> None:
+        def say(text: str, place: str = f"fold {number + 1} of {len(labels)}") -> None:
             if report is not None:
-                report(f"{place}: {done} of {total} wavelengths converged")
+                report(f"{place}: {text}")
 
         held_out = folds.label == label
         train = clean(raw.take(~held_out), bilateral=bilateral, method=options.method).samples
         angles = np.minimum(raw.theta_i[held_out], top), np.minimum(raw.theta_o[held_out], top), raw.phi_o[held_out]
-        found = predict(train, grid, options, *angles, say)
+        found = predict(train, grid, options, *angles, say, centres)
         predicted[held_out], status[number] = found.value, found.status
-    return HeldOut(predicted, folds.label, status)
+        if found.expected_error is not None:
+            expected[held_out] = found.expected_error
+    return HeldOut(predicted, expected if np.isfinite(expected).any() else None, folds.label, status)
 
 
 def score(held_out: HeldOut, raw: RawSamples, report: CleanReport) -> dict[str, np.ndarray]:
@@ -119,8 +150,27 @@ def score(held_out: HeldOut, raw: RawSamples, report: CleanReport) -> dict[str, 
     overall = held_out_scores(predicted, measured) | {"count": int(rows.sum()), "num_wavelengths": int(live.sum())}
     angle = half_angle(raw.theta_i[rows], raw.theta_o[rows], raw.phi_o[rows])
     binned = scores_by_half_angle(predicted, measured, angle)
-    return {f"scores/{name}": np.asarray(value) for name, value in overall.items()} | {
-        f"half_angle/{name}": value for name, value in binned.items()
+    found = _calibration(held_out, raw, rows, live) if held_out.expected_error is not None else {}
+    return (
+        found
+        | {f"scores/{name}": np.asarray(value) for name, value in overall.items()}
+        | {f"half_angle/{name}": value for name, value in binned.items()}
+    )
+
+
+def _calibration(held_out: HeldOut, raw: RawSamples, rows, live) -> dict[str, np.ndarray]:
+    """How many measured values lie within their expected error: overall, by incident angle, by decade of value."""
+    arrays = held_out.predicted, raw.value, held_out.expected_error
+    predicted, measured, expected = (np.asarray(a)[rows][:, live] for a in arrays)
+    _, group = cluster_incidences(raw.theta_i[rows])
+    angle = np.degrees(np.bincount(group, raw.theta_i[rows]) / np.bincount(group))[group]
+    by_angle = coverage_by(np.broadcast_to(angle[:, None], measured.shape), predicted, measured, expected)
+    decade = np.floor(np.log10(np.maximum(measured, 1e-300)))
+    by_decade = coverage_by(decade, predicted, measured, expected)
+    return {
+        "scores/coverage": np.asarray(coverage(predicted, measured, expected)),
+        **{f"coverage_by_theta_i/{name}": value for name, value in by_angle.items()},
+        **{f"coverage_by_decade/{name}": value for name, value in by_decade.items()},
     }
 
 

@@ -37,12 +37,12 @@ def run(args: argparse.Namespace) -> int:
     set_up_jax()
     import numpy as np
 
-    from sbrdf_jax.evaluation import evaluate_in_chunks, measured_wavelengths
+    from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_standard_error, measured_wavelengths
     from sbrdf_jax.files import whole_file
     from sbrdf_jax.store import load_stage
 
     stage = load_stage(args.result, args.stage)
-    if args.uncertainty:
+    if args.uncertainty and getattr(stage, "field", None) is None:
         raise UserError(f"--uncertainty: the {args.stage} stage of {args.result} has no standard errors")
     measured = np.asarray(measured_wavelengths(stage))
     wanted = None if args.wavelengths is None else parse_wavelengths(args.wavelengths, measured)
@@ -53,12 +53,16 @@ def run(args: argparse.Namespace) -> int:
             raise UserError(f"--output: {args.output} is also read, expected another file")
 
     names = wavelength_names(measured if wanted is None else wanted)
+    columns = [f"{name}{end}" for name in names for end in (("", "_se") if args.uncertainty else ("",))]
     radians = np.deg2rad(np.asarray(angles, float).reshape(-1, 3))
     with whole_file(output) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
-        file.write(",".join([*COLUMNS, *names]) + "\n")
+        file.write(",".join([*COLUMNS, *columns]) + "\n")
         for start in range(0, len(texts), ROWS_AT_A_TIME):
             theta_i, theta_o, phi_o = radians[start : start + ROWS_AT_A_TIME].T
             value = evaluate_in_chunks(stage, theta_i, theta_o, phi_o, wanted)
+            if args.uncertainty:
+                error, _ = evaluate_standard_error(stage, theta_i, theta_o, phi_o, wanted)
+                value = np.stack([value, error], axis=-1).reshape(len(value), -1)
             for text, row in zip(texts[start : start + ROWS_AT_A_TIME], value.tolist(), strict=True):
                 file.write(",".join([*text, *map(repr, row)]) + "\n")
     print(f"{output}: {len(texts)} directions x {len(names)} wavelengths, {args.stage} stage")

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.options import ResampleOptions
 from sbrdf_jax.records import GriddedBRDF, RawSamples
+from sbrdf_jax.resampling.guided import resample_guided
 from sbrdf_jax.resampling.paper import resample_paper
 
 
@@ -12,7 +13,7 @@ def resample(
     samples: RawSamples,
     grid: Grid,
     options: ResampleOptions,
-    report: Callable[[int, int], None] | None = None,
+    report: Callable[[str], None] | None = None,
 ) -> GriddedBRDF:
     """Resample a measurement by the method that the options name.
 
@@ -20,7 +21,7 @@ def resample(
         samples: Cleaned measurement.
         grid: Nodes and ties, from `make_grid`.
         options: Resolved options.
-        report: Called with (wavelengths converged, wavelengths) as the solver goes.
+        report: Told how far it is.
 
     Returns:
         The field on the grid.
@@ -29,5 +30,8 @@ def resample(
         ValueError: The method is not built.
     """
     if options.method == "paper":
-        return resample_paper(samples, grid, options, report)
-    raise ValueError(f"resample method {options.method!r} is not available; it is paper")
+        say = None if report is None else (lambda done, total: report(f"{done} of {total} wavelengths converged"))
+        return resample_paper(samples, grid, options, say)
+    if options.method == "guided":
+        return resample_guided(samples, grid, options, report)
+    raise ValueError(f"resample method {options.method!r} is not available; it is paper or guided")

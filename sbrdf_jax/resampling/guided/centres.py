@@ -1,0 +1,118 @@
+"""Where the samples are: merged, grouped by incident angle, padded: by angles alone, so that folds share it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sbrdf_jax.angles import fold_azimuth
+from sbrdf_jax.coverage import cluster_incidences
+from sbrdf_jax.records import RawSamples
+from sbrdf_jax.resampling.guided.coordinates import EXTRAPOLATION, Coordinates, guided_coordinates
+from sbrdf_jax.resampling.guided.covariance import (
+    GroupedFeatures,
+    covariance,
+    flatten,
+    group_coordinates,
+    group_features,
+)
+from sbrdf_jax.resampling.guided.merging import merge_samples
+from sbrdf_jax.resampling.guided.nodes import ModeVariance
+
+STEEPEST = np.deg2rad(85.0)
+MOST_GROUPS = 45  # more incident angles are sorted into so many bins
+MEMBER_BUCKET = 8  # members of a group are padded to a multiple
+
+
+@dataclasses.dataclass(eq=False)
+class Centres:
+    """Merged directions [group x member], flattened; padding has no sample."""
+
+    row: np.ndarray  # [sample] rows of the file, increasing
+    index: np.ndarray  # [sample] centre of each sample
+    group: np.ndarray  # [centre] incident angle's number
+    is_padding: np.ndarray  # [centre]
+    at: Coordinates  # [centre]
+    snapped: Coordinates  # [centre] each group at one incident angle
+    angles: np.ndarray  # [3, centre] theta_i, theta_o, folded azimuth [rad]
+    theta_limit: np.ndarray  # [2] rad
+    features: GroupedFeatures
+    _prior: dict[int, tuple[ModeVariance, jax.Array]] = dataclasses.field(default_factory=dict)
+
+    @property
+    def count(self) -> int:
+        """Centres, padding included."""
+        return len(self.group)
+
+    def prior(self, variance: ModeVariance) -> jax.Array:
+        """Prior covariance [centre, centre], computed once for each smoothness."""
+        if id(variance) not in self._prior:
+            self._prior[id(variance)] = variance, covariance(variance, self.snapped, self.features)
+        return self._prior[id(variance)][1]
+
+    def take(self, row: np.ndarray) -> "Centres":
+        """Return the centres for some of the rows: those left without a sample stay, and have no effect."""
+        place = np.searchsorted(self.row, row)
+        return dataclasses.replace(self, row=row, index=self.index[place])
+
+    @property
+    def number(self) -> np.ndarray:
+        """How many samples each centre stands for [centre]."""
+        return np.bincount(self.index, minlength=self.count).astype(float)
+
+    def mean(self, values: np.ndarray) -> np.ndarray:
+        """Average of values [sample, ...] over each centre's samples; 0 where there is none."""
+        total = np.zeros((self.count, *values.shape[1:]))
+        np.add.at(total, self.index, values)
+        return total / np.maximum(self.number, 1).reshape(-1, *[1] * (values.ndim - 1))
+
+
+def place_centres(samples: RawSamples) -> Centres:
+    """Merge, group and pad the directions of a measurement; its values have no influence."""
+    theta_i, theta_o, phi_o = samples.theta_i, samples.theta_o, samples.phi_o
+    measured = np.array([theta_i.max(), theta_o.max()])
+    limit = np.minimum(measured + EXTRAPOLATION, STEEPEST)
+    azimuth = fold_azimuth(phi_o)
+    half = np.asarray(guided_coordinates(*map(jnp.asarray, (theta_i, theta_o, azimuth, limit))).half)
+    cell = merge_samples(theta_i, theta_o, azimuth, half)
+    mean = [np.bincount(cell, x) / np.bincount(cell) for x in (theta_i, theta_o, azimuth)]
+    group = group_incidences(mean[0])
+    position, members = grouped_positions(group)
+    groups = int(group.max()) + 1
+    incidence = np.bincount(group, mean[0]) / np.bincount(group)
+    angles = np.full((3, groups * members), 0.5)
+    angles[0] = np.repeat(incidence, members)
+    angles[:, position] = mean
+    is_padding = np.ones(groups * members, bool)
+    is_padding[position] = False
+    grouped = group_coordinates(jnp.asarray(angles.reshape(3, groups, members)), jnp.asarray(limit))
+    return Centres(
+        row=samples.row,
+        index=position[cell],
+        group=np.repeat(np.arange(groups), members),
+        is_padding=is_padding,
+        at=guided_coordinates(*(jnp.asarray(a) for a in angles), jnp.asarray(limit)),
+        snapped=flatten(grouped),
+        angles=angles,
+        theta_limit=limit,
+        features=group_features(grouped),
+    )
+
+
+def group_incidences(theta_i: np.ndarray) -> np.ndarray:
+    """Return the number [direction] of each direction's group of nearly equal incident angles [rad]."""
+    known, group = cluster_incidences(theta_i)
+    if len(known) > MOST_GROUPS:  # a continuum
+        _, group = np.unique(np.floor(theta_i / (np.pi / 2 / MOST_GROUPS)), return_inverse=True)
+    return group.reshape(-1)
+
+
+def grouped_positions(group: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return each direction's position in a [group x member] layout, and the number of members of a group."""
+    sizes = np.bincount(group)
+    members = -(-int(sizes.max()) // MEMBER_BUCKET) * MEMBER_BUCKET
+    order = np.argsort(group, kind="stable")
+    rank = np.empty(len(group), int)
+    rank[order] = np.arange(len(group)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return group * members + rank, members

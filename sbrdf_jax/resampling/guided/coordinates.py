@@ -1,0 +1,97 @@
+"""Where the guided method works: coordinates in which a glossy field is smooth, and a generalised logarithm.
+
+Two systems share theta_i and theta_o: the third coordinate is log(theta_h[deg] + 1), which
+stretches the neighbourhood of the mirror direction, or the folded azimuth. Near either
+pole the azimuth is compressed to a constant, so that the field is exactly isotropic there.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sbrdf_jax.angles import fold_azimuth
+from sbrdf_jax.records import pytree
+
+COS_FLOOR = float(np.cos(np.deg2rad(85.0)))  # every cosine that divides or weighs is at least this
+EXTRAPOLATION = np.deg2rad(10.0)  # beyond the measured range the field goes on so far, then stays
+POLE_BLEND = 0.005  # sin(theta_i) sin(theta_o) at which the azimuth has half of its effect
+
+
+@pytree()
+class Coordinates:
+    """Directions as the guided method sees them; all of one shape."""
+
+    half: Any  # log(theta_h [deg] + 1)
+    azimuth: Any  # rad, folded to [0, pi], pi / 2 at the poles
+    theta_i: Any  # rad, clamped
+    theta_o: Any  # rad, clamped
+    tan2_half: Any  # tan(theta_h)^2
+    cos_difference: Any  # cosine of the angle between half vector and incidence
+
+
+def guided_coordinates(
+    theta_i: Float[Array, "*shape"],
+    theta_o: Float[Array, "*shape"],
+    phi_o: Float[Array, "*shape"],
+    theta_limit: Float[Array, " 2"],
+) -> Coordinates:
+    """Return the guided method's coordinates of directions.
+
+    theta_h comes from atan2 of the tangential and the normal part of the sum of both
+    directions: mirror samples have theta_h near 0.1 degrees, where arccos has no digits.
+
+    Args:
+        theta_i: Incident polar angle [rad].
+        theta_o: Outgoing polar angle [rad].
+        phi_o: Outgoing azimuth [rad]; the mirror direction is at pi.
+        theta_limit: Largest theta_i and theta_o [rad]; angles beyond are clamped to it.
+    """
+    theta_i = jnp.clip(theta_i, 0.0, theta_limit[0])
+    theta_o = jnp.clip(theta_o, 0.0, theta_limit[1])
+    azimuth = fold_azimuth(phi_o)
+    sin_i, sin_o = jnp.sin(theta_i), jnp.sin(theta_o)
+    # |tangential part|^2 as a sum of squares that vanishes exactly at the mirror direction
+    tangential2 = (sin_i - sin_o) ** 2 + 4 * sin_i * sin_o * jnp.cos(azimuth / 2) ** 2
+    normal = jnp.cos(theta_i) + jnp.cos(theta_o)
+    theta_h = jnp.arctan2(jnp.sqrt(tangential2 + 1e-24), normal)
+    cos_difference = jnp.sqrt(tangential2 + normal**2) / 2
+    blend = azimuth_share(theta_i, theta_o)
+    return Coordinates(
+        half=jnp.log1p(jnp.rad2deg(theta_h)),
+        azimuth=np.pi / 2 + (azimuth - np.pi / 2) * blend,
+        theta_i=theta_i,
+        theta_o=theta_o,
+        tan2_half=tangential2 / jnp.maximum(normal, 1e-3) ** 2,
+        cos_difference=jnp.clip(cos_difference, 0.0, 1.0),
+    )
+
+
+def azimuth_share(theta_i: Float[Array, "*shape"], theta_o: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """How much of the azimuth counts: 0 at either pole, nearly 1 away from them."""
+    product = jnp.sin(theta_i) * jnp.sin(theta_o)
+    return product / (product + POLE_BLEND)
+
+
+def floored_cos(theta: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Cosine of a polar angle [rad], at least cos 85 degrees."""
+    return jnp.maximum(jnp.cos(theta), COS_FLOOR)
+
+
+def to_log(
+    value: Float[Array, "*shape wavelength"], theta_i: Float[Array, "*shape"], floor: Float[Array, ""]
+) -> Float[Array, "*shape wavelength"]:
+    """Generalised logarithm z = log(1 + value sqrt(cos theta_i) / floor): relative above the floor, absolute below.
+
+    Values below 0 are counted as 0: they are at or below the noise.
+    """
+    scale = jnp.sqrt(floored_cos(theta_i))[..., None] / floor
+    return jnp.log1p(jnp.maximum(value, 0.0) * scale)
+
+
+def from_log(
+    z: Float[Array, "*shape wavelength"], theta_i: Float[Array, "*shape"], floor: Float[Array, ""]
+) -> Float[Array, "*shape wavelength"]:
+    """Inverse of `to_log`; never negative, because a z below 0 counts as 0."""
+    return floor * jnp.expm1(jnp.clip(z, 0.0, 80.0)) / jnp.sqrt(floored_cos(theta_i))[..., None]

@@ -1,0 +1,117 @@
+"""Covariances of the residual between directions, without a matrix of node pairs.
+
+With samples A x, energy x' E x and noise N, the normal equations (A' N^-1 A + E) x = A' N^-1 r
+have the dual (A E^-1 A' + N) a = r, x = E^-1 A' a: as large as the samples, not the nodes.
+Samples of one incident angle share the modes of theta_i, so A E^-1 A' needs the modes of
+the two other axes only, once per pair of a direction and an incident angle.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sbrdf_jax.records import pytree
+from sbrdf_jax.resampling.guided.coordinates import Coordinates, guided_coordinates
+from sbrdf_jax.resampling.guided.nodes import GRIDS, Features, ModeVariance, features_of, synthesise
+
+DIRECTIONS_AT_A_TIME = 256
+
+
+@pytree()
+class GroupedFeatures:
+    """Features of centres, grouped by incident angle."""
+
+    theta_i: Any  # [group, mode]
+    half: Any  # [group, member, mode]
+    azimuth: Any  # [group, member, mode]
+
+
+def group_coordinates(angles: Float[Array, "3 group member"], theta_limit: Float[Array, " 2"]) -> Coordinates:
+    """Coordinates of centres as the residual sees them: each group at one incident angle, its members' mean."""
+    at = guided_coordinates(angles[0], angles[1], angles[2], theta_limit)
+    mean = jnp.mean(at.theta_i, axis=1, keepdims=True)
+    return dataclasses.replace(at, theta_i=jnp.broadcast_to(mean, at.theta_i.shape))
+
+
+def group_features(at: Coordinates) -> GroupedFeatures:
+    """Return the features of grouped centres [group, member], of one theta_i each group."""
+    features = features_of(at)
+    return GroupedFeatures(theta_i=features.theta_i[:, 0], half=features.half, azimuth=features.azimuth)
+
+
+def flatten(at: Coordinates) -> Coordinates:
+    """Return coordinates with all their axes made one."""
+    return jax.tree.map(lambda x: x.reshape(-1), at)
+
+
+def _along_theta_i(variance, first, second):
+    """Sum over the modes of theta_i: [direction, group, other mode]."""
+    flat = jnp.moveaxis(jnp.asarray(variance), 1, 0).reshape(variance.shape[1], -1)
+    pairs = first[:, None, :] * second[None, :, :]
+    return pairs @ flat
+
+
+def _covariance(variance: ModeVariance, left: Features, right: GroupedFeatures):
+    total = 0.0
+    for name in GRIDS:
+        weight = _along_theta_i(getattr(variance, name), left.theta_i, right.theta_i)
+        weighted = weight * getattr(left, name)[:, None, :]
+        total = total + jnp.einsum("dgf,gmf->dgm", weighted, getattr(right, name))
+    return total.reshape(left.theta_i.shape[0], -1)
+
+
+@jax.jit
+def covariance(variance: ModeVariance, at: Coordinates, centres: GroupedFeatures) -> Float[Array, "direction centre"]:
+    """Prior covariance A E^-1 A' of the residual between directions and grouped centres (flattened)."""
+    return in_chunks(lambda chunk: _covariance(variance, features_of(chunk), centres), at, DIRECTIONS_AT_A_TIME)
+
+
+def in_chunks(function: Callable[[Any], Array], directions: Any, size: int) -> Array:
+    """Map a function of directions [direction] over chunks of equal size, so that memory stays bounded."""
+    count = jax.tree.leaves(directions)[0].shape[0]
+    size = min(size, max(count, 1))
+    chunks = jax.tree.map(lambda x: jnp.pad(x, (0, -count % size)).reshape(-1, size), directions)
+    out = jax.lax.map(function, chunks)
+    return out.reshape(-1, *out.shape[2:])[:count]
+
+
+@jax.jit
+def prior_variance(variance: ModeVariance, at: Coordinates) -> Float[Array, " direction"]:
+    """Prior variance of the residual in each direction: the diagonal of `covariance` with itself."""
+    features = features_of(at)
+    total = jnp.zeros_like(at.theta_i)
+    for name in GRIDS:
+        part = getattr(variance, name)
+        flat = jnp.moveaxis(jnp.asarray(part), 1, 0).reshape(part.shape[1], -1)
+        total = total + jnp.sum((features.theta_i**2 @ flat) * getattr(features, name) ** 2, axis=1)
+    return total
+
+
+def mode_sums(
+    centres: GroupedFeatures, dual: Float[Array, "centre wavelength"]
+) -> dict[str, Float[Array, "first theta_i theta_o wavelength"]]:
+    """Sum the centres' features, weighed by `dual`: A' in terms of modes, for both grids."""
+    grouped = dual.reshape(*centres.half.shape[:2], -1)
+    sums = {}
+    for name, axes in GRIDS.items():
+        by_group = jnp.einsum("gmf,gmw->gfw", getattr(centres, name), grouped)
+        modes = jnp.einsum("gk,gfw->kfw", centres.theta_i, by_group)
+        modes = modes.reshape(axes[1].count, axes[0].count, axes[2].count, -1)
+        sums[name] = jnp.moveaxis(modes, 0, 1)
+    return sums
+
+
+@jax.jit
+def node_values(
+    variance: ModeVariance, centres: GroupedFeatures, dual: Float[Array, "centre wavelength"]
+) -> tuple[Float[Array, "half theta_i theta_o wavelength"], Float[Array, "azimuth theta_i theta_o wavelength"]]:
+    """Return the nodes x = E^-1 A' a of both grids, from dual coefficients a."""
+    sums = mode_sums(centres, dual)
+    half, azimuth = (
+        synthesise(sums[name] * jnp.asarray(getattr(variance, name))[..., None], axes) for name, axes in GRIDS.items()
+    )
+    return half, azimuth

@@ -1,0 +1,141 @@
+"""What the data say about their own errors: floor, drop-outs, and the local scale of the residuals."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.spatial
+from jaxtyping import Array, Float
+
+from sbrdf_jax.records import pytree
+
+SMALLEST_FLOOR = 5e-4  # 1/sr, an albedo of 0.16 %: below it, what is measured is mostly clipped noise
+FLOOR_SHARE = (0.03, 0.3)  # bounds of the floor, as shares of the measurement's typical value
+DARK_SHARE = 0.2
+TO_SIGMA = 1.4826  # median absolute deviation to standard deviation
+NUM_NEIGHBOURS = 25
+NEIGHBOUR_SCALE = (0.5, 0.25, 0.4)  # of half, theta_i, theta_o, where residuals are compared
+OUTLIER = 5.0  # residuals so many times the local scale begin to lose weight
+MAX_FACTOR = 4.0  # largest noise variance of an outlier, relative; clusters of drop-outs keep some say
+SAMPLES_OF_SPECTRUM = 8
+COVERED = 0.6827
+TABLE_WIDTH = 0.6  # nodes of the table over which residuals are pooled
+
+
+def estimate_floor(theta_i: np.ndarray, theta_o: np.ndarray, azimuth: np.ndarray, value: np.ndarray) -> float:
+    """Estimate where noise stops being relative, from differences of neighbours in the dark.
+
+    Args:
+        theta_i: Incident polar angles [rad].
+        theta_o: Outgoing polar angles [rad].
+        azimuth: Folded azimuths [rad].
+        value: BRDF [sample, wavelength] [1/sr].
+
+    Returns:
+        Floor of the generalised logarithm [1/sr].
+    """
+    place = np.stack([20 * theta_i, np.sin(theta_o) * np.cos(azimuth), np.sin(theta_o) * np.sin(azimuth)], axis=1)
+    neighbour = np.asarray(scipy.spatial.KDTree(place).query(place, k=2)[1])
+    other = value[neighbour[:, 1]]
+    level, difference = (value + other) / 2, np.abs(value - other)
+    positive = level > 0
+    typical = float(np.median(level[positive]))
+    dark = positive & (level <= np.quantile(level[positive], DARK_SHARE))
+    noise = TO_SIGMA * float(np.median(difference[dark])) / np.sqrt(2)
+    return float(np.clip(max(noise, SMALLEST_FLOOR), FLOOR_SHARE[0] * typical, FLOOR_SHARE[1] * typical))
+
+
+def noise_factors(half: np.ndarray, theta_i: np.ndarray, theta_o: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Noise variance of each sample relative to its neighbours', from leave-one-out residuals.
+
+    A sample whose residual is more than `OUTLIER` times what its neighbours show is a drop-out
+    or a glint: its weight falls, but not to nothing.
+
+    Args:
+        half: log(theta_h [deg] + 1) [sample].
+        theta_i: Incident polar angles [rad].
+        theta_o: Outgoing polar angles [rad].
+        residual: Leave-one-out residuals in z [sample, wavelength].
+    """
+    size = np.maximum(np.sqrt(np.mean(np.clip(residual, -1.0, 1.0) ** 2, axis=1)), 1e-5)
+    place = np.stack([half, theta_i, theta_o], axis=1) / np.asarray(NEIGHBOUR_SCALE)
+    k = min(NUM_NEIGHBOURS, len(size))
+    if k < 5:
+        return np.ones(len(size))
+    neighbour = np.asarray(scipy.spatial.KDTree(place).query(place, k=k)[1])
+    local = np.exp(np.median(np.log(size)[neighbour[:, 1:]], axis=1))
+    excess = np.maximum(size / local - OUTLIER, 0.0)
+    return np.minimum(1 + excess**2, MAX_FACTOR)
+
+
+@pytree()
+class ResidualScale:
+    """Local scale of standardised residuals on a uniform table over (theta_i, half, z)."""
+
+    log_scale: Any  # [theta_i, half, z]
+    start: Any  # [3]
+    step: Any  # [3]
+
+
+def fit_residual_scale(
+    theta_i: np.ndarray,
+    half: np.ndarray,
+    z: np.ndarray,
+    standardised: np.ndarray,
+    shape: tuple[int, int, int] = (7, 7, 7),
+) -> ResidualScale:
+    """Calibrate: the scale below which 68 % of the standardised residuals lie, where they were measured.
+
+    Args:
+        theta_i: Incident polar angles [rad] [sample].
+        half: log(theta_h [deg] + 1) [sample].
+        z: Predicted generalised logarithm [sample, wavelength].
+        standardised: Residual over its predicted deviation [sample, wavelength].
+        shape: Numbers of table nodes.
+    """
+    every = max(1, z.shape[1] // SAMPLES_OF_SPECTRUM)
+    z, standardised = z[:, ::every], np.abs(standardised[:, ::every])
+    wide = np.ones_like(z)
+    features = np.stack([theta_i[:, None] * wide, half[:, None] * wide, z], axis=-1).reshape(-1, 3)
+    size = standardised.reshape(-1)
+    start, stop = np.quantile(features, 0.01, axis=0), np.quantile(features, 0.99, axis=0)
+    start[1] = 0.0  # the mirror direction, however few its samples
+    step = np.maximum((stop - start) / (np.asarray(shape) - 1), 1e-3)
+    order = np.argsort(size)
+    features, size = (np.clip(features[order], start, stop) - start) / step, size[order]
+    near = [np.exp(-0.5 * ((features[:, k, None] - np.arange(shape[k])) / TABLE_WIDTH) ** 2) for k in range(3)]
+    table = np.empty(shape)
+    for i, j in np.ndindex(shape[:2]):
+        # far from all samples: the nearest ones decide
+        cumulative = np.cumsum((near[0][:, i] * near[1][:, j])[:, None] * near[2] + 1e-9, axis=0)
+        for k in range(shape[2]):
+            place = np.searchsorted(cumulative[:, k], COVERED * cumulative[-1, k])
+            table[i, j, k] = size[min(place, len(size) - 1)]
+    return ResidualScale(
+        log_scale=jnp.log(jnp.maximum(jnp.asarray(table), 1e-6)), start=jnp.asarray(start), step=jnp.asarray(step)
+    )
+
+
+def residual_scale(
+    scale: ResidualScale,
+    theta_i: Float[Array, " direction"],
+    half: Float[Array, " direction"],
+    z: Float[Array, "direction wavelength"],
+) -> Float[Array, "direction wavelength"]:
+    """Interpolate the table of `fit_residual_scale`, linearly in its logarithm."""
+    shape = scale.log_scale.shape
+    ones = jnp.ones_like(z)
+    total = jnp.zeros_like(z)
+    places = []
+    for axis, feature in enumerate((theta_i[:, None] * ones, half[:, None] * ones, z)):
+        x = jnp.clip((feature - scale.start[axis]) / scale.step[axis], 0.0, shape[axis] - 1.0)
+        low = jnp.clip(jnp.floor(x), 0.0, shape[axis] - 2.0)
+        places.append((low.astype(jnp.int32), x - low))
+    for corner in np.ndindex(2, 2, 2):
+        weight = jnp.ones_like(z)
+        index = []
+        for (low, part), up in zip(places, corner, strict=True):
+            weight = weight * (part if up else 1 - part)
+            index.append(low + np.int32(up))
+        total = total + weight * scale.log_scale[index[0], index[1], index[2]]
+    return jnp.exp(total)

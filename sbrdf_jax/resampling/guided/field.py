@@ -1,0 +1,131 @@
+"""The fitted field and its evaluation: lobe model plus the residual of two grids, in the generalised logarithm."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sbrdf_jax.records import pytree
+from sbrdf_jax.resampling.guided.coordinates import Coordinates, floored_cos, from_log, guided_coordinates
+from sbrdf_jax.resampling.guided.covariance import (
+    covariance,
+    flatten,
+    group_coordinates,
+    group_features,
+    in_chunks,
+    prior_variance,
+)
+from sbrdf_jax.resampling.guided.error_model import ResidualScale, residual_scale
+from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
+from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, interpolate
+from sbrdf_jax.resampling.guided.smoothing import factorise
+
+DIRECTIONS_AT_A_TIME = 1024
+
+
+@pytree()
+class GuidedField:
+    """All that evaluates the resampled field and its standard error at any direction.
+
+    The centres are the measured directions, grouped by incident angle; the standard error
+    follows from where they are and how far each is trusted.
+    """
+
+    wavelength_nm: Any  # [wavelength]
+    floor: Any  # 1/sr
+    lobe: LobeModel
+    half: Any  # [half, theta_i, theta_o, wavelength] residual of z at the nodes of the half-angle grid
+    azimuth: Any  # [azimuth, theta_i, theta_o, wavelength] the same of the azimuth grid
+    theta_limit: Any  # [2] rad
+    centre: Any  # [3, group, member] theta_i, theta_o, folded azimuth [rad]
+    noise: Any  # [group, member] variance of z relative to the prior's
+    noise_factor: Any  # [group, member] above 1 where neighbours contradict a direction
+    noise_level: Any  # variance of one new measurement
+    variance: ModeVariance
+    scale: ResidualScale
+    multiplier: Any  # [group, member, wavelength] unknowns of the bounded problem
+    model_residual: Any  # [wavelength] relative gradient norm of the lobe model's fit
+    curve: Any  # [3, trial] prior (place in PRIORS), noise, mean root of the leave-one-out residuals, squared
+
+
+@jax.jit
+def evaluate_direction(
+    field: GuidedField, theta_i: Float[Array, ""], theta_o: Float[Array, ""], phi_o: Float[Array, ""]
+) -> Float[Array, " wavelength"]:
+    """Evaluate the resampled field in one direction, at the measured wavelengths [1/sr].
+
+    Never negative, finite everywhere, and independent of phi_o where theta_i or theta_o is 0.
+    """
+    at = guided_coordinates(theta_i, theta_o, phi_o, field.theta_limit)
+    return from_log(_log_value(field, at), at.theta_i, field.floor)
+
+
+def _log_value(field: GuidedField, at: Coordinates):
+    z = lobe_log_value(field.lobe, at, field.floor)
+    for name, axes in GRIDS.items():
+        z = z + interpolate(getattr(field, name), (getattr(at, name), at.theta_i, at.theta_o), axes)
+    return z
+
+
+@jax.jit
+def evaluate_directions(
+    field: GuidedField,
+    theta_i: Float[Array, " direction"],
+    theta_o: Float[Array, " direction"],
+    phi_o: Float[Array, " direction"],
+) -> Float[Array, "direction wavelength"]:
+    """Evaluate many directions, in chunks."""
+
+    def of_chunk(chunk):
+        return jax.vmap(lambda *angles: evaluate_direction(field, *angles))(*chunk)
+
+    return in_chunks(of_chunk, (theta_i, theta_o, phi_o), DIRECTIONS_AT_A_TIME)
+
+
+@jax.jit
+def standard_error(
+    field: GuidedField,
+    theta_i: Float[Array, " direction"],
+    theta_o: Float[Array, " direction"],
+    phi_o: Float[Array, " direction"],
+) -> tuple[Float[Array, "direction wavelength"], Float[Array, "direction wavelength"]]:
+    """Standard error of the field, and the noise of one measurement there.
+
+    The shape comes from the same matrix as the field, the local scale from residuals of
+    samples left out: 68 % of new samples lie within the root of the sum of both squares.
+
+    Args:
+        field: The fitted field.
+        theta_i: Polar angle of incidence [rad].
+        theta_o: Polar angle of exitance [rad].
+        phi_o: Azimuth of exitance [rad]; the mirror direction is at pi.
+
+    Returns:
+        Standard error and noise [1/sr], at the measured wavelengths.
+    """
+    at = guided_coordinates(theta_i, theta_o, phi_o, field.theta_limit)
+    z = in_chunks(jax.vmap(lambda place: _log_value(field, place)), at, DIRECTIONS_AT_A_TIME)
+    centres = group_coordinates(field.centre, field.theta_limit)
+    variance = posterior_variance(field.variance, at, centres, field.noise)
+    unit = residual_scale(field.scale, at.theta_i, at.half, z) * slope(z, at, field.floor)
+    return unit * jnp.sqrt(variance)[:, None], unit * jnp.sqrt(field.noise_level)
+
+
+def slope(z: Float[Array, "direction wavelength"], at: Coordinates, floor) -> Float[Array, "direction wavelength"]:
+    """Derivative of the BRDF by z [1/sr]."""
+    return floor * jnp.exp(jnp.clip(z, 0.0, 80.0)) / jnp.sqrt(floored_cos(at.theta_i))[:, None]
+
+
+def posterior_variance(
+    variance: ModeVariance, at: Coordinates, centres: Coordinates, noise: Float[Array, "group member"]
+) -> Float[Array, " direction"]:
+    """Variance of the residual given the samples at the grouped centres: k** - k*' (K + N)^-1 k*."""
+    features = group_features(centres)
+    factor = factorise(covariance(variance, flatten(centres), features), noise.reshape(-1))
+
+    def of_chunk(chunk):
+        root = jax.scipy.linalg.solve_triangular(factor, covariance(variance, chunk, features).T, lower=True)
+        return jnp.maximum(prior_variance(variance, chunk) - jnp.sum(root**2, axis=0), 0.0)
+
+    return in_chunks(of_chunk, at, DIRECTIONS_AT_A_TIME)

@@ -1,0 +1,133 @@
+"""Samples to field: floor, lobe model, smoothness, weights, bounded solution, error scale, in this order."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from sbrdf_jax.angles import fold_azimuth
+from sbrdf_jax.nnls import ProjectedNewton
+from sbrdf_jax.records import RawSamples
+from sbrdf_jax.resampling.guided.bounds import solve_bounded
+from sbrdf_jax.resampling.guided.centres import Centres, place_centres
+from sbrdf_jax.resampling.guided.coordinates import floored_cos, from_log, to_log
+from sbrdf_jax.resampling.guided.covariance import node_values
+from sbrdf_jax.resampling.guided.error_model import ResidualScale, estimate_floor, fit_residual_scale, noise_factors
+from sbrdf_jax.resampling.guided.field import GuidedField
+from sbrdf_jax.resampling.guided.lobe_model import (
+    density_weights,
+    fit_lobe_model,
+    lobe_log_value,
+    relative_gradient,
+)
+from sbrdf_jax.resampling.guided.smoothing import (
+    PADDING_NOISE,
+    PRIORS,
+    choose_smoothing,
+    factorise,
+    invert,
+    leave_group_out,
+    noise_of,
+)
+
+CALIBRATION_GROUPS = 5
+
+
+class GuidedFit(NamedTuple):
+    """A fitted field, and how well each wavelength was solved."""
+
+    field: GuidedField
+    kkt_residual: np.ndarray  # [wavelength] relative, of the bounded problem
+    num_steps: np.ndarray  # [wavelength]
+    status: np.ndarray  # [wavelength] Status
+
+
+def fit_guided(
+    samples: RawSamples,
+    *,
+    weight: float | None = None,
+    tolerance: float = 1e-6,
+    centres: Centres | None = None,
+    report: Callable[[str], None] | None = None,
+) -> GuidedFit:
+    """Fit the guided field to a cleaned measurement.
+
+    Args:
+        samples: Measurement of a bilateral material; azimuths are folded. Every value is finite.
+        weight: Noise variance of z relative to the prior's; None: chosen by leave-one-out.
+        tolerance: Relative KKT residual to reach.
+        centres: Where the samples are; several fits may share what depends on angles alone.
+        report: Told of each step.
+    """
+    say = report or (lambda _: None)
+    if centres is None:
+        centres = place_centres(samples)
+    number = centres.number
+    seen = number > 0
+    floor = estimate_floor(samples.theta_i, samples.theta_o, fold_azimuth(samples.phi_o), samples.value)
+    z_sample = to_log(jnp.asarray(samples.value), jnp.asarray(samples.theta_i), jnp.asarray(floor))
+    z = centres.mean(np.asarray(z_sample))
+
+    say("lobe model")
+    half = np.asarray(centres.at.half)
+    density = np.zeros(centres.count)
+    density[seen] = density_weights(half[seen])
+    lobe = fit_lobe_model(centres.mean(np.maximum(samples.value, 0.0)), z, centres.at, density, floor)
+    model = np.where(seen[:, None], np.asarray(lobe_log_value(lobe, centres.at, jnp.asarray(floor))), 0.0)
+    residual = np.where(seen[:, None], z - model, 0.0)
+
+    say("smoothness")
+    choice = choose_smoothing(centres, residual, number, weight)
+    factor = np.ones(centres.count)
+    factor[seen] = noise_factors(half[seen], *centres.angles[:2, seen], choice.left_out[seen])
+    noise = np.where(seen, noise_of(choice.noise, number) * factor, PADDING_NOISE)
+    inverse = invert(factorise(centres.prior(choice.variance), jnp.asarray(noise)))
+
+    say("bounded least squares")
+    arrays = (jnp.asarray(a) for a in (noise, residual, model))
+    bounded = solve_bounded(inverse, *arrays, ProjectedNewton(tolerance=tolerance))
+    half_nodes, azimuth_nodes = node_values(choice.variance, centres.features, bounded.dual)
+
+    say("error scale")
+    out, variance = _left_out_fifths(centres, seen, np.asarray(inverse), np.asarray(inverse @ jnp.asarray(residual)))
+    # a centre's own extra noise, or what averaging took from it, is not that of a new measurement
+    spread = np.maximum(variance - noise, 0.0) + choice.noise
+    groups = centres.features.theta_i.shape[0]
+    shape = (3, groups, centres.count // groups)
+    names, levels, scores = zip(*choice.curve, strict=True)
+    field = GuidedField(
+        wavelength_nm=jnp.asarray(samples.wavelength_nm),
+        floor=jnp.asarray(floor),
+        lobe=lobe,
+        half=half_nodes,
+        azimuth=azimuth_nodes,
+        theta_limit=jnp.asarray(centres.theta_limit),
+        centre=jnp.asarray(centres.angles.reshape(shape)),
+        noise=jnp.asarray(noise.reshape(shape[1:])),
+        noise_factor=jnp.asarray(factor.reshape(shape[1:])),
+        noise_level=jnp.asarray(choice.noise),
+        variance=choice.variance,
+        scale=_calibrate(centres, samples, z - out, spread, floor),
+        multiplier=bounded.multiplier.reshape(*shape[1:], -1),
+        model_residual=relative_gradient(lobe, centres.at, jnp.asarray(z), jnp.asarray(density), jnp.asarray(floor)),
+        curve=jnp.asarray(np.stack([[list(PRIORS).index(name) for name in names], levels, scores])),
+    )
+    return GuidedFit(field, *(np.asarray(a) for a in (bounded.kkt_residual, bounded.num_steps, bounded.status)))
+
+
+def _left_out_fifths(centres: Centres, seen, inverse, dual) -> tuple[np.ndarray, np.ndarray]:
+    """Exact residuals of leaving random fifths out, and their variances."""
+    group = np.random.default_rng(0).permutation(centres.count) % CALIBRATION_GROUPS
+    return leave_group_out(inverse, dual, np.where(seen, group, -1))
+
+
+def _calibrate(centres: Centres, samples: RawSamples, predicted, spread, floor: float) -> ResidualScale:
+    """Calibrate the error scale by how far samples lie from predictions that did not see them."""
+    centre = centres.index
+    z = predicted[centre]
+    theta_i = centres.angles[0, centre]
+    value = np.asarray(from_log(jnp.asarray(z), jnp.asarray(theta_i), jnp.asarray(floor)))
+    slope = floor * np.exp(np.clip(z, 0.0, 80.0)) / np.sqrt(np.asarray(floored_cos(jnp.asarray(theta_i))))[:, None]
+    standardised = (np.maximum(samples.value, 0.0) - value) / (slope * np.sqrt(spread[centre])[:, None])
+    return fit_residual_scale(theta_i, np.asarray(centres.at.half)[centre], z, standardised)
