@@ -77,4 +77,4 @@ def test_host_and_jax_take_the_same_steps(rng):
     by_jax = solve_nnls(operator, rhs, ProjectedNewton(tolerance=1e-10))
     by_host, steps = minimise_on_host(np.asarray(operator.matrix), np.asarray(rhs), np.zeros(rhs.shape), 1e-10)
     np.testing.assert_allclose(by_host, by_jax.value, rtol=0, atol=1e-7 * by_host.max())  # 1e-10 times the condition
-    assert (np.abs(steps - np.asarray(by_jax.num_steps)) <= 0.2 * steps + 5).all()
+    assert (np.abs(steps - np.asarray(by_jax.num_steps)) <= 5).all()  # rounding moves the last ones
