@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Real
 from sbrdf_jax.encoding import decode
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, SpectralField
 from sbrdf_jax.representation.paper import compact_coefficient
-from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_direction, standard_error
+from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_direction, evaluate_with_error
 from sbrdf_jax.sinc import Window, azimuth_distance, polar_distance, separable_weights
 
 CHUNK_BYTES = 128 * 2**20  # working memory of one chunk of directions
@@ -308,7 +308,7 @@ def evaluate_standard_error(
     if not isinstance(field, GuidedField):
         raise TypeError(f"{type(result).__name__}: its method has no standard error")
     angles = np.broadcast_arrays(*(np.asarray(a, float) for a in (theta_i, theta_o, phi_o)))
-    found = standard_error(field, *(jnp.asarray(a.reshape(-1)) for a in angles))
+    _, *found = evaluate_with_error(field, *(jnp.asarray(a.reshape(-1)) for a in angles))
     both = np.asarray(found).reshape(2, *angles[0].shape, -1)
     if wavelength_nm is not None:
         measured = np.asarray(field.wavelength_nm)

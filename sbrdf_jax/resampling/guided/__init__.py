@@ -15,7 +15,7 @@ from sbrdf_jax.options import ResampleOptions
 from sbrdf_jax.records import GriddedBRDF, RawSamples, Status
 from sbrdf_jax.resampling.extrapolation import extrapolated_nodes
 from sbrdf_jax.resampling.guided.centres import Centres, place_centres
-from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_directions, standard_error
+from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_with_error
 from sbrdf_jax.resampling.guided.fit import GuidedFit, fit_guided
 from sbrdf_jax.resampling.guided.smoothing import PADDING_NOISE
 
@@ -104,9 +104,8 @@ def read_nodes(field: GuidedField, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     angles = np.meshgrid(grid.theta_i, grid.theta_o, grid.phi_o[: half + 1], indexing="ij")
     shape = (*angles[0].shape, -1)
     flat = [jnp.asarray(a.reshape(-1)) for a in angles]
-    value = np.asarray(evaluate_directions(field, *flat)).reshape(shape)
-    error = np.asarray(standard_error(field, *flat)[0]).reshape(shape)
-    return value[:, :, distinct], error[:, :, distinct]
+    value, error, _ = (np.asarray(a).reshape(shape)[:, :, distinct] for a in evaluate_with_error(field, *flat))
+    return value, error
 
 
 def describe_fit(field: GuidedField) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ G = N - N (K + N)^-1 N the posterior covariance at the centres, well conditioned
 nodes' own normal matrix is not.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -27,6 +28,7 @@ class Bounded(NamedTuple):
     status: jax.Array  # [wavelength]
 
 
+@functools.partial(jax.jit, static_argnames="method")
 def solve_bounded(
     inverse: Float[Array, "centre centre"],
     noise: Float[Array, " centre"],

@@ -7,6 +7,7 @@ pole the azimuth is compressed to a constant, so that the field is exactly isotr
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -31,6 +32,7 @@ class Coordinates:
     cos_difference: Any  # cosine of the angle between half vector and incidence
 
 
+@jax.jit
 def guided_coordinates(
     theta_i: Float[Array, "*shape"],
     theta_o: Float[Array, "*shape"],
@@ -79,6 +81,7 @@ def floored_cos(theta: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return jnp.maximum(jnp.cos(theta), COS_FLOOR)
 
 
+@jax.jit
 def to_log(
     value: Float[Array, "*shape wavelength"], theta_i: Float[Array, "*shape"], floor: Float[Array, ""]
 ) -> Float[Array, "*shape wavelength"]:
@@ -90,6 +93,7 @@ def to_log(
     return jnp.log1p(jnp.maximum(value, 0.0) * scale)
 
 
+@jax.jit
 def from_log(
     z: Float[Array, "*shape wavelength"], theta_i: Float[Array, "*shape"], floor: Float[Array, ""]
 ) -> Float[Array, "*shape wavelength"]:

@@ -30,6 +30,7 @@ class GroupedFeatures:
     azimuth: Any  # [group, member, mode]
 
 
+@jax.jit
 def group_coordinates(angles: Float[Array, "3 group member"], theta_limit: Float[Array, " 2"]) -> Coordinates:
     """Coordinates of centres as the residual sees them: each group at one incident angle, its members' mean."""
     at = guided_coordinates(angles[0], angles[1], angles[2], theta_limit)
@@ -37,6 +38,7 @@ def group_coordinates(angles: Float[Array, "3 group member"], theta_limit: Float
     return dataclasses.replace(at, theta_i=jnp.broadcast_to(mean, at.theta_i.shape))
 
 
+@jax.jit
 def group_features(at: Coordinates) -> GroupedFeatures:
     """Return the features of grouped centres [group, member], of one theta_i each group."""
     features = features_of(at)

@@ -69,31 +69,19 @@ def _log_value(field: GuidedField, at: Coordinates):
 
 
 @jax.jit
-def evaluate_directions(
+def evaluate_with_error(
     field: GuidedField,
     theta_i: Float[Array, " direction"],
     theta_o: Float[Array, " direction"],
     phi_o: Float[Array, " direction"],
-) -> Float[Array, "direction wavelength"]:
-    """Evaluate many directions, in chunks."""
+) -> tuple[
+    Float[Array, "direction wavelength"], Float[Array, "direction wavelength"], Float[Array, "direction wavelength"]
+]:
+    """Evaluate the field, its standard error, and the noise of one measurement.
 
-    def of_chunk(chunk):
-        return jax.vmap(lambda *angles: evaluate_direction(field, *angles))(*chunk)
-
-    return in_chunks(of_chunk, (theta_i, theta_o, phi_o), DIRECTIONS_AT_A_TIME)
-
-
-@jax.jit
-def standard_error(
-    field: GuidedField,
-    theta_i: Float[Array, " direction"],
-    theta_o: Float[Array, " direction"],
-    phi_o: Float[Array, " direction"],
-) -> tuple[Float[Array, "direction wavelength"], Float[Array, "direction wavelength"]]:
-    """Standard error of the field, and the noise of one measurement there.
-
-    The shape comes from the same matrix as the field, the local scale from residuals of
-    samples left out: 68 % of new samples lie within the root of the sum of both squares.
+    The shape of the error comes from the same matrix as the field, its local scale from
+    residuals of samples left out: 68 % of new samples lie within the root of the sum of
+    both squares.
 
     Args:
         field: The fitted field.
@@ -102,30 +90,25 @@ def standard_error(
         phi_o: Azimuth of exitance [rad]; the mirror direction is at pi.
 
     Returns:
-        Standard error and noise [1/sr], at the measured wavelengths.
+        BRDF, standard error and noise [1/sr], at the measured wavelengths.
     """
-    at = guided_coordinates(theta_i, theta_o, phi_o, field.theta_limit)
-    z = in_chunks(jax.vmap(lambda place: _log_value(field, place)), at, DIRECTIONS_AT_A_TIME)
     centres = group_coordinates(field.centre, field.theta_limit)
-    variance = posterior_variance(field.variance, at, centres, field.noise)
-    unit = residual_scale(field.scale, at.theta_i, at.half, z) * slope(z, at, field.floor)
-    return unit * jnp.sqrt(variance)[:, None], unit * jnp.sqrt(field.noise_level)
+    features = group_features(centres)
+    factor = factorise(covariance(field.variance, flatten(centres), features), field.noise.reshape(-1))
+
+    def of_chunk(angles):
+        at = guided_coordinates(*angles, field.theta_limit)
+        z = jax.vmap(lambda place: _log_value(field, place))(at)
+        root = jax.scipy.linalg.solve_triangular(factor, covariance(field.variance, at, features).T, lower=True)
+        variance = jnp.maximum(prior_variance(field.variance, at) - jnp.sum(root**2, axis=0), 0.0)
+        unit = residual_scale(field.scale, at.theta_i, at.half, z) * slope(z, at, field.floor)
+        value = from_log(z, at.theta_i, field.floor)
+        return jnp.stack([value, unit * jnp.sqrt(variance)[:, None], unit * jnp.sqrt(field.noise_level)], axis=1)
+
+    found = in_chunks(of_chunk, (theta_i, theta_o, phi_o), DIRECTIONS_AT_A_TIME)
+    return found[:, 0], found[:, 1], found[:, 2]
 
 
 def slope(z: Float[Array, "direction wavelength"], at: Coordinates, floor) -> Float[Array, "direction wavelength"]:
     """Derivative of the BRDF by z [1/sr]."""
     return floor * jnp.exp(jnp.clip(z, 0.0, 80.0)) / jnp.sqrt(floored_cos(at.theta_i))[:, None]
-
-
-def posterior_variance(
-    variance: ModeVariance, at: Coordinates, centres: Coordinates, noise: Float[Array, "group member"]
-) -> Float[Array, " direction"]:
-    """Variance of the residual given the samples at the grouped centres: k** - k*' (K + N)^-1 k*."""
-    features = group_features(centres)
-    factor = factorise(covariance(variance, flatten(centres), features), noise.reshape(-1))
-
-    def of_chunk(chunk):
-        root = jax.scipy.linalg.solve_triangular(factor, covariance(variance, chunk, features).T, lower=True)
-        return jnp.maximum(prior_variance(variance, chunk) - jnp.sum(root**2, axis=0), 0.0)
-
-    return in_chunks(of_chunk, at, DIRECTIONS_AT_A_TIME)

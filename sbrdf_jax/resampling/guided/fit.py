@@ -19,13 +19,11 @@ from sbrdf_jax.resampling.guided.lobe_model import (
     density_weights,
     fit_lobe_model,
     lobe_log_value,
-    relative_gradient,
 )
 from sbrdf_jax.resampling.guided.smoothing import (
     PADDING_NOISE,
     PRIORS,
     choose_smoothing,
-    factorise,
     invert,
     leave_group_out,
     noise_of,
@@ -73,7 +71,7 @@ def fit_guided(
     half = np.asarray(centres.at.half)
     density = np.zeros(centres.count)
     density[seen] = density_weights(half[seen])
-    lobe = fit_lobe_model(centres.mean(np.maximum(samples.value, 0.0)), z, centres.at, density, floor)
+    lobe, model_residual = fit_lobe_model(centres.mean(np.maximum(samples.value, 0.0)), z, centres.at, density, floor)
     model = np.where(seen[:, None], np.asarray(lobe_log_value(lobe, centres.at, jnp.asarray(floor))), 0.0)
     residual = np.where(seen[:, None], z - model, 0.0)
 
@@ -82,7 +80,7 @@ def fit_guided(
     factor = np.ones(centres.count)
     factor[seen] = noise_factors(half[seen], *centres.angles[:2, seen], choice.left_out[seen])
     noise = np.where(seen, noise_of(choice.noise, number) * factor, PADDING_NOISE)
-    inverse = invert(factorise(centres.prior(choice.variance), jnp.asarray(noise)))
+    inverse = invert(centres.prior(choice.variance), jnp.asarray(noise))
 
     say("bounded least squares")
     arrays = (jnp.asarray(a) for a in (noise, residual, model))
@@ -90,7 +88,7 @@ def fit_guided(
     half_nodes, azimuth_nodes = node_values(choice.variance, centres.features, bounded.dual)
 
     say("error scale")
-    out, variance = _left_out_fifths(centres, seen, np.asarray(inverse), np.asarray(inverse @ jnp.asarray(residual)))
+    out, variance = _left_out_fifths(centres, seen, np.asarray(inverse), np.asarray(inverse) @ residual)
     # a centre's own extra noise, or what averaging took from it, is not that of a new measurement
     spread = np.maximum(variance - noise, 0.0) + choice.noise
     groups = centres.features.theta_i.shape[0]
@@ -110,7 +108,7 @@ def fit_guided(
         variance=choice.variance,
         scale=_calibrate(centres, samples, z - out, spread, floor),
         multiplier=bounded.multiplier.reshape(*shape[1:], -1),
-        model_residual=relative_gradient(lobe, centres.at, jnp.asarray(z), jnp.asarray(density), jnp.asarray(floor)),
+        model_residual=model_residual,
         curve=jnp.asarray(np.stack([[list(PRIORS).index(name) for name in names], levels, scores])),
     )
     return GuidedFit(field, *(np.asarray(a) for a in (bounded.kkt_residual, bounded.num_steps, bounded.status)))

@@ -51,6 +51,7 @@ def fresnel(cos: Float[Array, "*shape"], index: Float[Array, ""]) -> Float[Array
     return (senkrecht**2 + parallel**2) / 2
 
 
+@jax.jit
 def lobe_terms(shape: Float[Array, " 9"], at: Coordinates) -> Float[Array, "*shape 4"]:
     """Return the four terms at amplitude 1, finite everywhere; Fresnel factors are 1 at normal incidence.
 
@@ -78,6 +79,7 @@ def lobe_terms(shape: Float[Array, " 9"], at: Coordinates) -> Float[Array, "*sha
     return jnp.stack(terms, axis=-1)
 
 
+@jax.jit
 def lobe_log_value(model: LobeModel, at: Coordinates, floor: Float[Array, ""]) -> Float[Array, "*shape wavelength"]:
     """Generalised logarithm z of the model."""
     value = lobe_terms(model.shape, at) @ jnp.exp(model.log_amplitude)
@@ -104,7 +106,7 @@ def _loss(residual, weight, shape, prior_weight):
 
 
 @functools.partial(jax.jit, static_argnames=("fit_shape", "max_steps"))
-def _minimise(model, at, z, weight, floor, *, fit_shape: bool, max_steps: int) -> LobeModel:
+def _minimise(model, at, z, weight, floor, *, fit_shape: bool, max_steps: int) -> tuple[LobeModel, Any]:
     """Levenberg-Marquardt with an arrow-shaped Jacobian.
 
     The 4 x 4 block of each wavelength is eliminated; the shared shape solves a 9 x 9 Schur complement.
@@ -156,7 +158,12 @@ def _minimise(model, at, z, weight, floor, *, fit_shape: bool, max_steps: int) -
 
     start = _loss(_residual(model, lobe_terms(model.shape, at), z, scale)[0], weight, model.shape, prior_weight)
     state = _State(model, start, jnp.asarray(1e-2), jnp.asarray(0), jnp.asarray(False))
-    return jax.lax.while_loop(lambda s: (s.step < max_steps) & ~s.done, step, state).model
+    model = jax.lax.while_loop(lambda s: (s.step < max_steps) & ~s.done, step, state).model
+    residual, parts = _residual(model, lobe_terms(model.shape, at), z, scale)
+    pull = weight[:, None] * residual / jnp.sqrt(1 + (residual / LOSS_SCALE) ** 2)
+    gradient = jnp.linalg.norm(jnp.einsum("nam,nm->am", parts, pull), axis=0)
+    size = jnp.linalg.norm(jnp.einsum("nam,nm->am", parts, jnp.abs(pull)), axis=0)
+    return model, gradient / jnp.maximum(size, 1e-300)
 
 
 def density_weights(half: np.ndarray) -> np.ndarray:
@@ -167,10 +174,11 @@ def density_weights(half: np.ndarray) -> np.ndarray:
     return weight / weight.mean()
 
 
-def _start(value: np.ndarray, at: Coordinates) -> np.ndarray:
+def _start(value: np.ndarray, at: Coordinates, used: np.ndarray) -> np.ndarray:
     """Starting log amplitudes [4, wavelength] from medians of ratios in rings of theta_h."""
-    terms = np.asarray(lobe_terms(jnp.asarray(PRIOR), at))
-    theta_h = np.expm1(np.asarray(at.half))  # deg
+    terms = np.asarray(lobe_terms(jnp.asarray(PRIOR), at))[used]
+    theta_h = np.expm1(np.asarray(at.half))[used]  # deg
+    value = value[used]
     tiny = 1e-6 * max(float(np.median(value[value > 0])), 1e-12)
     diffuse = np.maximum(np.median(value / terms[:, :1], axis=0), tiny)
     rows = [diffuse]
@@ -181,7 +189,9 @@ def _start(value: np.ndarray, at: Coordinates) -> np.ndarray:
     return np.clip(np.log(np.stack(rows)), *LOG_AMPLITUDE_RANGE)
 
 
-def fit_lobe_model(value: np.ndarray, z: np.ndarray, at: Coordinates, weight: np.ndarray, floor: float) -> LobeModel:
+def fit_lobe_model(
+    value: np.ndarray, z: np.ndarray, at: Coordinates, weight: np.ndarray, floor: float
+) -> tuple[LobeModel, jax.Array]:
     """Fit the model to z with a soft-L1 loss.
 
     The shape is fitted to some wavelengths spread over the range, the amplitudes to all.
@@ -192,29 +202,14 @@ def fit_lobe_model(value: np.ndarray, z: np.ndarray, at: Coordinates, weight: np
         at: Coordinates of the samples.
         weight: Weight per sample; 0 for padding.
         floor: The generalised logarithm's floor [1/sr].
+
+    Returns:
+        The model, and per wavelength the relative norm of the loss's gradient by its log amplitudes.
     """
-    used = weight > 0
-    amplitude = _start(value[used], jax.tree.map(lambda x: x[used], at))
+    amplitude = _start(value, at, weight > 0)
     every = max(1, z.shape[1] // NUM_FIT_WAVELENGTHS)
     model = LobeModel(shape=jnp.asarray(PRIOR), log_amplitude=jnp.asarray(amplitude[:, ::every]))
     given = (jnp.asarray(weight), jnp.asarray(floor))
-    model = _minimise(model, at, jnp.asarray(z[:, ::every]), *given, fit_shape=True, max_steps=SHAPE_STEPS)
+    model, _ = _minimise(model, at, jnp.asarray(z[:, ::every]), *given, fit_shape=True, max_steps=SHAPE_STEPS)
     model = LobeModel(shape=model.shape, log_amplitude=jnp.asarray(amplitude))
     return _minimise(model, at, jnp.asarray(z), *given, fit_shape=False, max_steps=AMPLITUDE_STEPS)
-
-
-@jax.jit
-def relative_gradient(
-    model: LobeModel,
-    at: Coordinates,
-    z: Float[Array, "sample wavelength"],
-    weight: Float[Array, " sample"],
-    floor: Float[Array, ""],
-) -> Float[Array, " wavelength"]:
-    """Gradient of each wavelength's loss by its log amplitudes over the loss at its start: 0 at a minimum."""
-    scale = jnp.sqrt(floored_cos(at.theta_i))[:, None] / floor
-    residual, parts = _residual(model, lobe_terms(model.shape, at), z, scale)
-    pull = weight[:, None] * residual / jnp.sqrt(1 + (residual / LOSS_SCALE) ** 2)
-    gradient = jnp.einsum("nam,nm->am", parts, pull)
-    size = jnp.einsum("nam,nm->am", jnp.abs(parts), jnp.abs(pull))
-    return jnp.linalg.norm(gradient, axis=0) / jnp.maximum(jnp.linalg.norm(size, axis=0), 1e-300)

@@ -37,25 +37,19 @@ def factorise(prior: Float[Array, "centre centre"], noise: Float[Array, " centre
 
 
 @jax.jit
-def solve_dual(
-    factor: Float[Array, "centre centre"], residual: Float[Array, "centre wavelength"]
-) -> Float[Array, "centre wavelength"]:
-    """Dual coefficients: (prior + noise)^-1 residual."""
-    return jax.scipy.linalg.cho_solve((factor, True), residual)
-
-
-@jax.jit
 def leave_one_out(
-    factor: Float[Array, "centre centre"], dual: Float[Array, "centre wavelength"]
+    prior: Float[Array, "centre centre"], noise: Float[Array, " centre"], residual: Float[Array, "centre wavelength"]
 ) -> Float[Array, "centre wavelength"]:
     """Exact leave-one-out residuals: with C the inverse of prior plus noise, e_i = (C r)_i / C_ii."""
+    factor = factorise(prior, noise)
     inverse = jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(factor)), lower=True)
-    return dual / jnp.sum(inverse**2, axis=0)[:, None]
+    return inverse.T @ (inverse @ residual) / jnp.sum(inverse**2, axis=0)[:, None]
 
 
 @jax.jit
-def invert(factor: Float[Array, "centre centre"]) -> Float[Array, "centre centre"]:
-    """Inverse of prior plus noise, for leave-group-out."""
+def invert(prior: Float[Array, "centre centre"], noise: Float[Array, " centre"]) -> Float[Array, "centre centre"]:
+    """Inverse of prior plus noise."""
+    factor = factorise(prior, noise)
     inverse = jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(factor)), lower=True)
     return inverse.T @ inverse
 
@@ -98,8 +92,7 @@ def choose_smoothing(centres: Centres, residual: np.ndarray, number: np.ndarray,
 
     def score(name: str, level: float) -> float:
         prior = centres.prior(mode_variance(PRIORS[name], CONSTANT))
-        factor = factorise(prior, jnp.asarray(noise_of(level, number)))
-        out = np.asarray(leave_one_out(factor, solve_dual(factor, jnp.asarray(residual))))
+        out = np.asarray(leave_one_out(prior, jnp.asarray(noise_of(level, number)), jnp.asarray(residual)))
         left_out[name, level] = out
         value = float(np.mean(np.sqrt(np.abs(out[used]))) ** 2)
         curve.append((name, level, value if np.isfinite(value) else np.inf))
