@@ -68,10 +68,11 @@ class ResampleOptions:
 
     __pydantic_config__ = _STRICT
 
-    method: Literal["paper", "guided"] = "paper"
+    method: Literal["paper", "guided"] = "guided"
     """paper: equations 4 to 10 of Xu's paper as printed; guided: this project's own."""
     smoothness_weight: Auto | Literal["data"] | Annotated[float, Ge(0)] = "auto"
-    """Weight of the second-difference rows; auto: 1.0 for paper, data for guided; data: chosen by the data."""
+    """Weight of smoothness; for paper of the second-difference rows (auto: 1.0), for guided noise variance relative to
+    the prior's (auto: data, chosen by leave-one-out)."""
     window: Literal["none", "product", "factor"] = "factor"
     """Cosine window of equation 17, used in evaluation only."""
     tolerance: Auto | Share = "auto"

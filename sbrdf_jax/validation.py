@@ -29,8 +29,8 @@ class Prediction:
     """What one fit says at the directions that it did not see."""
 
     value: Float[np.ndarray, "direction wavelength"]  # 1/sr
-    expected_error: Float[np.ndarray, "direction wavelength"] | None  # 1/sr, of the field and one measurement together
     status: Int[np.ndarray, " wavelength"]  # Status of the fit
+    expected_error: Float[np.ndarray, "direction wavelength"] | None = None  # 1/sr, field and one measurement together
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,9 +38,9 @@ class HeldOut:
     """Predictions of all rows, each by a fit that did not see its fold."""
 
     predicted: Float[np.ndarray, "row wavelength"]  # 1/sr; nan where the row is in no fold
-    expected_error: Float[np.ndarray, "row wavelength"] | None  # 1/sr, where the method has one
     fold: Int[np.ndarray, " row"]  # NO_FOLD where the row is in none
     status: Int[np.ndarray, "fold wavelength"]  # Status of each fold's fit, folds in increasing order
+    expected_error: Float[np.ndarray, "row wavelength"] | None = None  # 1/sr, where the method has one
 
 
 def predict(
@@ -71,9 +71,9 @@ def predict(
     if options.method == "guided":
         fit = fit_field(train, options, report, None if centres is None else centres.take(train.row))
         error, noise = evaluate_standard_error(fit.field, *angles)
-        return Prediction(evaluate_in_chunks(fit.field, *angles), np.hypot(error, noise), fit.status)
+        return Prediction(evaluate_in_chunks(fit.field, *angles), fit.status, np.hypot(error, noise))
     gridded = resample(train, grid, options, report)
-    return Prediction(evaluate_in_chunks(gridded, *angles), None, np.asarray(gridded.status, int))
+    return Prediction(evaluate_in_chunks(gridded, *angles), np.asarray(gridded.status, int))
 
 
 def share_angles(raw: RawSamples, options: ResampleOptions, bilateral: bool) -> Centres | None:
@@ -127,7 +127,7 @@ def predict_held_out(
         predicted[held_out], status[number] = found.value, found.status
         if found.expected_error is not None:
             expected[held_out] = found.expected_error
-    return HeldOut(predicted, expected if np.isfinite(expected).any() else None, folds.label, status)
+    return HeldOut(predicted, folds.label, status, expected if np.isfinite(expected).any() else None)
 
 
 def score(held_out: HeldOut, raw: RawSamples, report: CleanReport) -> dict[str, np.ndarray]:

@@ -93,8 +93,6 @@ WRONG_KEYS_AND_VALUES = [
 NOT_BUILT = {
     "input.format": ["rgl-bsdf", "merl", "astm", "pab", "inplane", "alta"],
     "grid.reciprocal": ["true"],
-    "resample.method": ["guided"],
-    "resample.smoothness_weight": ["data"],
     "encode.basis": ["data"],
     "represent.method": ["lobe_harmonics", "lobe_tensor"],
     "scene": ["{}", "{wavelength_nm: {min: 500, max: 600}}", "{theta_i_deg: [0, 45]}"],
@@ -117,7 +115,18 @@ WRONG_OVERRIDES = [
     ("output.path=", "command line: output.path=: found nothing (null)", "text"),
     ("output.path=[", "command line: output.path=[: found text that is not YAML", "expected YAML"),
     ("grid.x=a\nb", "command line: grid.x=a b: unknown key", ""),
-    ("resample.method=guided", "command line: resample.method=guided: found 'guided'", "not available yet"),
+    ("represent.method=lobe_tensor", "command line: represent.method=lobe_tensor: found 'lobe_te", "not available yet"),
+    (
+        "resample={method: paper, smoothness_weight: data}",
+        "command line: resample={method",
+        "found data, which method paper",
+    ),
+    ("resample.smoothness_weight=0", "command line: resample.smoothness_weight=0: found 0", "above 0"),
+    (
+        "input={path: x, bilateral: false}",
+        "command line: input={path: x",
+        "bilateral: found false; expected auto or true, because method guided",
+    ),
     ("represent.target.numbers=9", "command line: represent.target.numbers=9: found ratio and numbers", "one of"),
 ]
 
@@ -200,7 +209,9 @@ def test_numbers_and_comments_are_those_of_yaml_1_2():
     assert options.encode.coefficients == 19
     assert parse_config(GLASS + "grid: {theta_i_step_deg: 12.857142857142858}").grid.theta_i_step_deg == 90 / 7
     assert parse_config("input: {path: builtin:x, mirror_azimuth_deg: 0}").input.mirror_azimuth_deg == 0
-    assert parse_config("input: {path: builtin:x, bilateral: false}").input.bilateral is False
+    assert (
+        parse_config("input: {path: builtin:x, bilateral: false}\nresample: {method: paper}").input.bilateral is False
+    )
     assert parse_config(GLASS + "encode: {basis: cosine, coefficients: 20}").encode.coefficients == 20
 
 
@@ -275,8 +286,9 @@ def test_a_clash_of_file_and_override_names_what_was_written_last():
     assert message.startswith("command line: scene.theta_i_deg.min=7: ") and "found no 'max'" in message
 
 
-def test_autos_of_paper():
-    options = resolve(DEFAULTS)
+def test_autos_of_the_defaults_and_of_paper():
+    assert resolve(DEFAULTS).resample == ResampleOptions(method="guided", smoothness_weight="data", tolerance=1e-6)
+    options = resolve(dataclasses.replace(DEFAULTS, resample=ResampleOptions(method="paper")))
     assert options.resample == ResampleOptions(method="paper", smoothness_weight=1.0, tolerance=1e-8)
     assert options.encode == EncodeOptions(basis="fourier", coefficients=19)
     assert (options.represent.method, options.represent.max_degree) == ("paper", 4)
@@ -304,7 +316,7 @@ def test_autos_of_other_methods_and_given_values():
     [
         "",
         "represent: {target: {error: 0.045}, lobe: tan}",
-        "resample: {tolerance: 1e-12, smoothness_weight: 0}\noutput: {path: 'a: #b, 1e-8.h5', report: false}",
+        "resample: {method: paper, tolerance: 1e-12, smoothness_weight: 0}\noutput: {path: 'a: #b, 1e-8.h5'}",
         "grid: {theta_i_step_deg: 12.857142857142858}\nencode: {basis: identity}",
         f"output: {{path: {'long name/' * 40}x.h5}}",
     ],

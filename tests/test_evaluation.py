@@ -14,7 +14,13 @@ from small_results import UNIFORM_NM, WAVELENGTH_NM, small_compact, small_field,
 from tolerances import GRADIENT, LANE, ROUNDING, tolerance
 
 from sbrdf_jax.encoding import decode
-from sbrdf_jax.evaluation import evaluate, evaluate_in_chunks, evaluate_on_axes, spectral_weights
+from sbrdf_jax.evaluation import (
+    evaluate,
+    evaluate_in_chunks,
+    evaluate_on_axes,
+    evaluate_standard_error,
+    spectral_weights,
+)
 from sbrdf_jax.representation.paper import compact_coefficient
 from sbrdf_jax.runtime import compile_clock
 
@@ -192,11 +198,11 @@ def test_a_second_chunk_or_result_of_equal_shape_traces_nothing(rng):
     assert clock.num_compiled == 0
 
 
-def test_a_record_or_a_method_without_a_kernel_is_an_error(rng):
+def test_a_record_without_a_kernel_is_an_error(rng):
     with pytest.raises(TypeError, match="no kernel is registered"):
         evaluate(small_compact(rng).basis, 0.1, 0.2, 0.3)
-    with pytest.raises(TypeError, match="field of its own"):
-        evaluate(dataclasses.replace(small_grid(rng), method="guided"), 0.1, 0.2, 0.3)
+    with pytest.raises(TypeError, match="no standard error"):
+        evaluate_standard_error(small_grid(rng), *np.full((3, 1), 0.1))
 
 
 def test_float32_is_float64_within_its_rounding(rng):

@@ -18,7 +18,13 @@ from sbrdf_jax.cli import main
 from sbrdf_jax.formats import write_samples
 
 SMALL_GRID = ["grid.theta_i_step_deg=30", "grid.theta_o_step_deg=22.5", "grid.phi_o_step_deg=45"]
-FAST = [*SMALL_GRID, "represent.max_degree=1", "represent.lobe=angle_squared", "output.report=false"]
+FAST = [
+    *SMALL_GRID,
+    "resample.method=paper",
+    "represent.max_degree=1",
+    "represent.lobe=angle_squared",
+    "output.report=false",
+]
 HELD_OUT = ["validate.folds=2", "validate.leave_one_theta_i_out=true"]
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 
 from sbrdf_jax.angles import fold_azimuth
 from sbrdf_jax.coverage import cluster_incidences
@@ -62,10 +63,10 @@ class Centres:
         return np.bincount(self.index, minlength=self.count).astype(float)
 
     def mean(self, values: np.ndarray) -> np.ndarray:
-        """Average of values [sample, ...] over each centre's samples; 0 where there is none."""
-        total = np.zeros((self.count, *values.shape[1:]))
-        np.add.at(total, self.index, values)
-        return total / np.maximum(self.number, 1).reshape(-1, *[1] * (values.ndim - 1))
+        """Average of values [sample, wavelength] over each centre's samples; 0 where there is none."""
+        count = len(self.index)
+        sums = scipy.sparse.csr_array((np.ones(count), (self.index, np.arange(count))), shape=(self.count, count))
+        return (sums @ values) / np.maximum(self.number, 1)[:, None]
 
 
 def place_centres(samples: RawSamples) -> Centres:
@@ -75,9 +76,11 @@ def place_centres(samples: RawSamples) -> Centres:
     limit = np.minimum(measured + EXTRAPOLATION, STEEPEST)
     azimuth = fold_azimuth(phi_o)
     half = np.asarray(guided_coordinates(*map(jnp.asarray, (theta_i, theta_o, azimuth, limit))).half)
-    cell = merge_samples(theta_i, theta_o, azimuth, half)
+    group_of_sample = group_incidences(theta_i)
+    cell = merge_samples(group_of_sample, theta_o, azimuth, half)
     mean = [np.bincount(cell, x) / np.bincount(cell) for x in (theta_i, theta_o, azimuth)]
-    group = group_incidences(mean[0])
+    group = np.zeros(len(mean[0]), int)
+    group[cell] = group_of_sample
     position, members = grouped_positions(group)
     groups = int(group.max()) + 1
     incidence = np.bincount(group, mean[0]) / np.bincount(group)

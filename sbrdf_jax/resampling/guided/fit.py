@@ -11,7 +11,7 @@ from sbrdf_jax.nnls import ProjectedNewton
 from sbrdf_jax.records import RawSamples
 from sbrdf_jax.resampling.guided.bounds import solve_bounded
 from sbrdf_jax.resampling.guided.centres import Centres, place_centres
-from sbrdf_jax.resampling.guided.coordinates import floored_cos, from_log, to_log
+from sbrdf_jax.resampling.guided.coordinates import floored_cos, from_log, guided_coordinates, to_log
 from sbrdf_jax.resampling.guided.covariance import node_values
 from sbrdf_jax.resampling.guided.error_model import ResidualScale, estimate_floor, fit_residual_scale, noise_factors
 from sbrdf_jax.resampling.guided.field import GuidedField
@@ -72,8 +72,11 @@ def fit_guided(
     density = np.zeros(centres.count)
     density[seen] = density_weights(half[seen])
     lobe, model_residual = fit_lobe_model(centres.mean(np.maximum(samples.value, 0.0)), z, centres.at, density, floor)
+    at_samples = guided_coordinates(
+        *(jnp.asarray(a) for a in (samples.theta_i, samples.theta_o, samples.phi_o, centres.theta_limit))
+    )
+    residual = centres.mean(np.asarray(z_sample) - np.asarray(lobe_log_value(lobe, at_samples, jnp.asarray(floor))))
     model = np.where(seen[:, None], np.asarray(lobe_log_value(lobe, centres.at, jnp.asarray(floor))), 0.0)
-    residual = np.where(seen[:, None], z - model, 0.0)
 
     say("smoothness")
     choice = choose_smoothing(centres, residual, number, weight)
@@ -106,7 +109,7 @@ def fit_guided(
         noise_factor=jnp.asarray(factor.reshape(shape[1:])),
         noise_level=jnp.asarray(choice.noise),
         variance=choice.variance,
-        scale=_calibrate(centres, samples, z - out, spread, floor),
+        scale=_calibrate(centres, samples, model + residual - out, spread, floor),
         multiplier=bounded.multiplier.reshape(*shape[1:], -1),
         model_residual=model_residual,
         curve=jnp.asarray(np.stack([[list(PRIORS).index(name) for name in names], levels, scores])),

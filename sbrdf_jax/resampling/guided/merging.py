@@ -6,21 +6,21 @@ noise would be taken for structure. Past `MAX_CENTRES` the cells grow until few 
 
 import numpy as np
 
-MAX_CENTRES = 3600
+MAX_CENTRES = 1600
 SMALLEST_CELL = np.deg2rad(0.3)
 GROWTH = 1.3
 HALF_STRETCH = 4.0  # cells are so much longer in log(theta_h + 1) than in radians
 
 
 def merge_samples(
-    theta_i: np.ndarray, theta_o: np.ndarray, azimuth: np.ndarray, half: np.ndarray, max_centres: int = MAX_CENTRES
+    group: np.ndarray, theta_o: np.ndarray, azimuth: np.ndarray, half: np.ndarray, max_centres: int = MAX_CENTRES
 ) -> np.ndarray:
-    """Return each sample's cell, by theta_i, theta_o, azimuth [rad] and half = log(theta_h [deg] + 1)."""
+    """Return each sample's cell: by the group of theta_i, theta_o, azimuth [rad] and half = log(theta_h [deg] + 1)."""
     cell = SMALLEST_CELL
+    places = np.stack([theta_o, azimuth * np.sin(theta_o), half / HALF_STRETCH], axis=1)
     while True:
-        features = np.stack([theta_i, theta_o, azimuth * np.sin(theta_o), half / HALF_STRETCH], axis=1)
-        cells = np.round(features / cell).astype(np.int64)
+        cells = np.concatenate([group[:, None], np.round(places / cell).astype(np.int64)], axis=1)
         distinct, index = np.unique(cells, axis=0, return_inverse=True)
-        if len(distinct) <= max_centres:
+        if len(distinct) <= max(max_centres, 2 * (group.max() + 1)):
             return index.reshape(-1)
         cell *= GROWTH

@@ -116,11 +116,15 @@ def cubic_weights(x: Float[Array, "*shape"], axis: Axis) -> tuple[Int[Array, "*s
     return first.astype(jnp.int32), weight
 
 
+def _four(first: Int[Array, "*shape"]) -> Int[Array, "*shape 4"]:
+    return jnp.stack([first + np.int32(k) for k in range(4)], axis=-1)
+
+
 def axis_features(x: Float[Array, "*shape"], axis: Axis) -> Float[Array, "*shape mode"]:
     """Values of the interpolated cosine modes at places along an axis."""
     first, weight = cubic_weights(x, axis)
     mirrored = np.pad(axis.modes, ((1, 1), (0, 0)), mode="reflect")
-    around = jnp.asarray(mirrored)[first[..., None] + np.arange(4, dtype=np.int32)]
+    around = jnp.asarray(mirrored)[_four(first)]
     return jnp.sum(weight[..., None] * around, axis=-2)
 
 
@@ -155,7 +159,7 @@ def interpolate(
     """Evaluate one grid at one place: eq. (5) with Keys' cubic kernel."""
     mirrored = jnp.pad(nodes, ((1, 1), (1, 1), (1, 1), (0, 0)), mode="reflect")
     found = [cubic_weights(x, axis) for x, axis in zip(places, axes, strict=True)]
-    index = [first[..., None] + np.arange(4, dtype=np.int32) for first, _ in found]
+    index = [_four(first) for first, _ in found]
     around = mirrored[index[0][:, None, None], index[1][None, :, None], index[2][None, None, :]]
     return jnp.einsum("i,j,k,ijkm->m", *(weight for _, weight in found), around)
 
