@@ -18,7 +18,12 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Real
 from sbrdf_jax.encoding import decode
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, SpectralField
 from sbrdf_jax.representation.paper import compact_coefficient
-from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_direction, evaluate_with_error
+from sbrdf_jax.resampling.guided.field import (
+    GuidedField,
+    each_direction,
+    evaluate_direction,
+    evaluate_with_error,
+)
 from sbrdf_jax.sinc import Window, azimuth_distance, polar_distance, separable_weights
 
 CHUNK_BYTES = 128 * 2**20  # working memory of one chunk of directions
@@ -65,7 +70,9 @@ def evaluate(
     angles = jnp.broadcast_arrays(*(jnp.asarray(a, dtype) for a in (theta_i, theta_o, phi_o)))
     wavelength = None if wavelength_nm is None else jnp.atleast_1d(jnp.asarray(wavelength_nm, dtype))
     kernel = functools.partial(direction_kernel, result, wavelength_nm=wavelength)
-    value = jax.vmap(kernel)(*(a.reshape(-1) for a in angles))
+    flat = tuple(a.reshape(-1) for a in angles)
+    is_guided = isinstance(getattr(result, "field", result), GuidedField)
+    value = each_direction(lambda angles: kernel(*angles), flat) if is_guided else jax.vmap(kernel)(*flat)
     if wavelength is not None:
         outside = outside_range(wavelength, jnp.asarray(measured_wavelengths(result), dtype))
         value = jnp.where(outside[None, :], jnp.nan, value)

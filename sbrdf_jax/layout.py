@@ -5,6 +5,7 @@ import json
 from collections.abc import Mapping
 
 import h5py
+import jax.numpy as jnp
 import numpy as np
 
 from sbrdf_jax.cleaning import CleanEntry, CleanReport, Flag
@@ -19,7 +20,7 @@ from sbrdf_jax.records import STATUS_TEXT, CompactBRDF, GriddedBRDF, SpectralBas
 from sbrdf_jax.resampling.guided.error_model import ResidualScale
 from sbrdf_jax.resampling.guided.field import GuidedField
 from sbrdf_jax.resampling.guided.lobe_model import SHAPE_NAMES, LobeModel
-from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance
+from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, mirror
 from sbrdf_jax.resampling.guided.smoothing import PRIORS
 from sbrdf_jax.scores import SCORE_TEXT
 
@@ -59,6 +60,8 @@ def write_guided(group: h5py.Group, field: GuidedField) -> None:
     """Write what evaluates the guided field at any direction."""
     record = {f.name: getattr(field, f.name) for f in dataclasses.fields(field)}
     arrays = {name: np.asarray(value) for name, value in record.items() if name not in GUIDED_PARTS}
+    for name in GRIDS:
+        arrays[name] = arrays[name][1:-1, 1:-1, 1:-1]  # the mirrored nodes follow
     for name in ("theta_limit", "centre"):
         arrays[f"{name}_deg"] = degrees(arrays.pop(name))
     parts = {name: {f: np.asarray(v) for f, v in vars(record[name]).items()} for name in GUIDED_PARTS}
@@ -164,7 +167,8 @@ def read_guided(group: h5py.Group) -> GuidedField:
     angles = {name: np.deg2rad(stored.pop(f"{name}_deg")) for name in ("theta_limit", "centre")}
     names = {f.name for f in dataclasses.fields(GuidedField)}
     plain = {name: np.asarray(value) for name, value in stored.items() if name in names}
-    return GuidedField(**plain, **parts, **angles)
+    nodes = {name: mirror(jnp.asarray(plain.pop(name))) for name in GRIDS}
+    return GuidedField(**plain, **parts, **angles, **nodes)
 
 
 def read_grid(group: h5py.Group, field: h5py.Group | None = None) -> GriddedBRDF:

@@ -24,7 +24,7 @@ from sbrdf_jax.resampling.guided.covariance import covariance, node_values, prio
 from sbrdf_jax.resampling.guided.error_model import MAX_FACTOR, estimate_floor, noise_factors
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, fit_lobe_model, lobe_log_value, lobe_terms
 from sbrdf_jax.resampling.guided.merging import merge_samples
-from sbrdf_jax.resampling.guided.nodes import GRIDS, interpolate, mode_variance
+from sbrdf_jax.resampling.guided.nodes import GRIDS, interpolate, mirror, mode_variance
 from sbrdf_jax.resampling.guided.smoothing import CONSTANT, PRIORS, invert, leave_group_out, leave_one_out
 from sbrdf_jax.scores import coverage, held_out_scores
 from sbrdf_jax.store import load_stage
@@ -140,7 +140,7 @@ def test_covariance_and_nodes_equal_dense_matrices(rng):
     nodes = node_values(VARIANCE, centres.features, jnp.asarray(dual))
     read_back = sum(
         np.stack([
-            interpolate(values, (getattr(at, name)[k], at.theta_i[k], at.theta_o[k]), axes) for k in range(9)
+            interpolate(mirror(values), (getattr(at, name)[k], at.theta_i[k], at.theta_o[k]), axes) for k in range(9)
         ])
         for values, (name, axes) in zip(nodes, GRIDS.items(), strict=True)
     )  # fmt: skip
@@ -347,7 +347,6 @@ def test_a_result_holds_the_field_and_its_errors(samples, tmp_path, rng):
 
 def test_held_out_samples_of_a_measured_paint(shared):
     raw = read(shared("data/cornell/garnet_red.brdf"), InputOptions(path="garnet_red"))
-    raw = dataclasses.replace(raw, wavelength_nm=raw.wavelength_nm[::8], value=raw.value[:, ::8])
     folds = Folds(read_fold_file(str(shared("cv/folds.csv")), raw.num_samples), "as given")
     grid = make_grid(raw, GridOptions(), bilateral=True)
     found = predict_held_out(raw, folds, grid, OPTIONS, bilateral=True)

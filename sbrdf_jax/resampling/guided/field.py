@@ -1,5 +1,6 @@
 """The fitted field and its evaluation: lobe model plus the residual of two grids, in the generalised logarithm."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -35,7 +36,7 @@ class GuidedField:
     wavelength_nm: Any  # [wavelength]
     floor: Any  # 1/sr
     lobe: LobeModel
-    half: Any  # [half, theta_i, theta_o, wavelength] residual of z at the nodes of the half-angle grid
+    half: Any  # [half, theta_i, theta_o, wavelength] residual of z at the nodes of the half-angle grid, mirrored
     azimuth: Any  # [azimuth, theta_i, theta_o, wavelength] the same of the azimuth grid
     theta_limit: Any  # [2] rad
     centre: Any  # [3, group, member] theta_i, theta_o, folded azimuth [rad]
@@ -68,6 +69,13 @@ def _log_value(field: GuidedField, at: Coordinates):
     return z
 
 
+def each_direction(function: Callable[[Any], Array], directions: Any) -> Array:
+    """Map a function of one direction: one after the other on a processor, where gathering for all at once is slower."""
+    if jax.default_backend() == "cpu":
+        return jax.lax.map(function, directions)
+    return jax.vmap(function)(directions)
+
+
 @jax.jit
 def evaluate_with_error(
     field: GuidedField,
@@ -98,7 +106,7 @@ def evaluate_with_error(
 
     def of_chunk(angles):
         at = guided_coordinates(*angles, field.theta_limit)
-        z = jax.vmap(lambda place: _log_value(field, place))(at)
+        z = each_direction(lambda place: _log_value(field, place), at)
         root = jax.scipy.linalg.solve_triangular(factor, covariance(field.variance, at, features).T, lower=True)
         variance = jnp.maximum(prior_variance(field.variance, at) - jnp.sum(root**2, axis=0), 0.0)
         unit = residual_scale(field.scale, at.theta_i, at.half, z) * slope(z, at, field.floor)

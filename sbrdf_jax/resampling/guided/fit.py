@@ -20,6 +20,7 @@ from sbrdf_jax.resampling.guided.lobe_model import (
     fit_lobe_model,
     lobe_log_value,
 )
+from sbrdf_jax.resampling.guided.nodes import mirror
 from sbrdf_jax.resampling.guided.smoothing import (
     PADDING_NOISE,
     PRIORS,
@@ -101,8 +102,8 @@ def fit_guided(
         wavelength_nm=jnp.asarray(samples.wavelength_nm),
         floor=jnp.asarray(floor),
         lobe=lobe,
-        half=half_nodes,
-        azimuth=azimuth_nodes,
+        half=mirror(half_nodes),
+        azimuth=mirror(azimuth_nodes),
         theta_limit=jnp.asarray(centres.theta_limit),
         centre=jnp.asarray(centres.angles.reshape(shape)),
         noise=jnp.asarray(noise.reshape(shape[1:])),

@@ -12,6 +12,7 @@ import functools
 import math
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -151,17 +152,27 @@ def features_of(at: Coordinates) -> Features:
     )
 
 
+def mirror(nodes: Float[Array, "first theta_i theta_o wavelength"]) -> Float[Array, "more more2 more3 wavelength"]:
+    """Add one mirrored node at each end of the three axes."""
+    return jnp.pad(nodes, ((1, 1), (1, 1), (1, 1), (0, 0)), mode="reflect")
+
+
 def interpolate(
-    nodes: Float[Array, "first theta_i theta_o wavelength"],
+    mirrored: Float[Array, "first theta_i theta_o wavelength"],
     places: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]],
     axes: tuple[Axis, Axis, Axis],
 ) -> Float[Array, " wavelength"]:
-    """Evaluate one grid at one place: eq. (5) with Keys' cubic kernel."""
-    mirrored = jnp.pad(nodes, ((1, 1), (1, 1), (1, 1), (0, 0)), mode="reflect")
-    found = [cubic_weights(x, axis) for x, axis in zip(places, axes, strict=True)]
-    index = [_four(first) for first, _ in found]
-    around = mirrored[index[0][:, None, None], index[1][None, :, None], index[2][None, None, :]]
-    return jnp.einsum("i,j,k,ijkm->m", *(weight for _, weight in found), around)
+    """Evaluate one grid at one place: eq. (5) with Keys' cubic kernel.
+
+    Args:
+        mirrored: Nodes, from `mirror`.
+        places: Where.
+        axes: The grid's axes.
+    """
+    first, weight = zip(*(cubic_weights(x, axis) for x, axis in zip(places, axes, strict=True)), strict=True)
+    around = jax.lax.dynamic_slice(mirrored, (*first, np.int32(0)), (4, 4, 4, mirrored.shape[-1]))
+    product = jnp.einsum("i,j,k->ijk", *weight)
+    return product.reshape(-1) @ around.reshape(64, -1)
 
 
 def synthesise(
