@@ -75,7 +75,7 @@ def covariance(variance: ModeVariance, at: Coordinates, centres: GroupedFeatures
 def in_chunks(function: Callable[[Any], Array], directions: Any, size: int) -> Array:
     """Map a function of directions [direction] over chunks of equal size, so that memory stays bounded."""
     count = jax.tree.leaves(directions)[0].shape[0]
-    size = min(size, max(count, 1))
+    size = -(-count // max(-(-count // size), 1)) if count else 1
     chunks = jax.tree.map(lambda x: jnp.pad(x, (0, -count % size)).reshape(-1, size), directions)
     out = jax.lax.map(function, chunks)
     return out.reshape(-1, *out.shape[2:])[:count]

@@ -20,9 +20,9 @@ from sbrdf_jax.resampling.guided.covariance import (
 from sbrdf_jax.resampling.guided.error_model import ResidualScale, residual_scale
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
 from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, interpolate
-from sbrdf_jax.resampling.guided.smoothing import factorise
 
 DIRECTIONS_AT_A_TIME = 1024
+SMALLEST_VARIANCE = 1e-6  # of z, relative to the prior's: what float32 can tell from nothing
 
 
 @pytree()
@@ -70,7 +70,7 @@ def _log_value(field: GuidedField, at: Coordinates):
 
 
 def each_direction(function: Callable[[Any], Array], directions: Any) -> Array:
-    """Map a function of one direction: one after the other on a processor, where gathering for all at once is slower."""
+    """Map a function of one direction: one by one on a processor, where gathering for all at once is slower."""
     if jax.default_backend() == "cpu":
         return jax.lax.map(function, directions)
     return jax.vmap(function)(directions)
@@ -102,13 +102,18 @@ def evaluate_with_error(
     """
     centres = group_coordinates(field.centre, field.theta_limit)
     features = group_features(centres)
-    factor = factorise(covariance(field.variance, flatten(centres), features), field.noise.reshape(-1))
+    prior = covariance(field.variance, flatten(centres), features)
+    factor = jnp.linalg.cholesky(prior + jnp.diag(field.noise.reshape(-1))).astype(jnp.float32)
+    variance_32, features_32 = jax.tree.map(lambda x: x.astype(jnp.float32), (field.variance, features))
 
     def of_chunk(angles):
         at = guided_coordinates(*angles, field.theta_limit)
         z = each_direction(lambda place: _log_value(field, place), at)
-        root = jax.scipy.linalg.solve_triangular(factor, covariance(field.variance, at, features).T, lower=True)
-        variance = jnp.maximum(prior_variance(field.variance, at) - jnp.sum(root**2, axis=0), 0.0)
+        at_32 = jax.tree.map(lambda x: x.astype(jnp.float32), at)
+        cross = covariance(variance_32, at_32, features_32)
+        root = jax.scipy.linalg.solve_triangular(factor, cross.T, lower=True)
+        explained = jnp.sum(root**2, axis=0).astype(z.dtype)
+        variance = jnp.maximum(prior_variance(field.variance, at) - explained, SMALLEST_VARIANCE)
         unit = residual_scale(field.scale, at.theta_i, at.half, z) * slope(z, at, field.floor)
         value = from_log(z, at.theta_i, field.floor)
         return jnp.stack([value, unit * jnp.sqrt(variance)[:, None], unit * jnp.sqrt(field.noise_level)], axis=1)

@@ -84,15 +84,15 @@ def fit_guided(
     factor = np.ones(centres.count)
     factor[seen] = noise_factors(half[seen], *centres.angles[:2, seen], choice.left_out[seen])
     noise = np.where(seen, noise_of(choice.noise, number) * factor, PADDING_NOISE)
-    inverse = invert(centres.prior(choice.variance), jnp.asarray(noise))
+    inverse = invert(np.asarray(centres.prior(choice.variance)), noise)
 
     say("bounded least squares")
     arrays = (jnp.asarray(a) for a in (noise, residual, model))
-    bounded = solve_bounded(inverse, *arrays, ProjectedNewton(tolerance=tolerance))
+    bounded = solve_bounded(jnp.asarray(inverse), *arrays, ProjectedNewton(tolerance=tolerance))
     half_nodes, azimuth_nodes = node_values(choice.variance, centres.features, bounded.dual)
 
     say("error scale")
-    out, variance = _left_out_fifths(centres, seen, np.asarray(inverse), np.asarray(inverse) @ residual)
+    out, variance = _left_out_fifths(centres, seen, inverse, inverse @ residual)
     # a centre's own extra noise, or what averaging took from it, is not that of a new measurement
     spread = np.maximum(variance - noise, 0.0) + choice.noise
     groups = centres.features.theta_i.shape[0]

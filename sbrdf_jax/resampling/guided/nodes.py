@@ -125,7 +125,7 @@ def axis_features(x: Float[Array, "*shape"], axis: Axis) -> Float[Array, "*shape
     """Values of the interpolated cosine modes at places along an axis."""
     first, weight = cubic_weights(x, axis)
     mirrored = np.pad(axis.modes, ((1, 1), (0, 0)), mode="reflect")
-    around = jnp.asarray(mirrored)[_four(first)]
+    around = jnp.asarray(mirrored, x.dtype)[_four(first)]
     return jnp.sum(weight[..., None] * around, axis=-2)
 
 

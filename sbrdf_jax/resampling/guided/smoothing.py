@@ -2,10 +2,9 @@
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+import scipy.linalg.blas
+import scipy.linalg.lapack
 
 from sbrdf_jax.resampling.guided.centres import Centres
 from sbrdf_jax.resampling.guided.nodes import ModeVariance, Term, mode_variance
@@ -30,28 +29,26 @@ class Choice(NamedTuple):
     left_out: np.ndarray  # [centre, wavelength] leave-one-out residuals
 
 
-@jax.jit
-def factorise(prior: Float[Array, "centre centre"], noise: Float[Array, " centre"]) -> Float[Array, "centre centre"]:
-    """Lower Cholesky factor of prior covariance plus noise."""
-    return jnp.linalg.cholesky(prior + jnp.diag(noise))
+def lower_inverse(prior: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Lower triangle of the inverse of prior covariance [centre, centre] plus noise [centre]; nan where it has none."""
+    total = np.array(prior, order="F")
+    total[np.diag_indices_from(total)] += noise
+    factor, failed = scipy.linalg.lapack.dpotrf(total, lower=1, overwrite_a=1)
+    if failed:
+        return np.full_like(total, np.nan)
+    return scipy.linalg.lapack.dpotri(factor, lower=1, overwrite_c=1)[0]
 
 
-@jax.jit
-def leave_one_out(
-    prior: Float[Array, "centre centre"], noise: Float[Array, " centre"], residual: Float[Array, "centre wavelength"]
-) -> Float[Array, "centre wavelength"]:
-    """Exact leave-one-out residuals: with C the inverse of prior plus noise, e_i = (C r)_i / C_ii."""
-    factor = factorise(prior, noise)
-    inverse = jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(factor)), lower=True)
-    return inverse.T @ (inverse @ residual) / jnp.sum(inverse**2, axis=0)[:, None]
+def invert(prior: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Inverse of prior covariance plus noise."""
+    lower = np.tril(lower_inverse(prior, noise))
+    return lower + np.tril(lower, -1).T
 
 
-@jax.jit
-def invert(prior: Float[Array, "centre centre"], noise: Float[Array, " centre"]) -> Float[Array, "centre centre"]:
-    """Inverse of prior plus noise."""
-    factor = factorise(prior, noise)
-    inverse = jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(factor)), lower=True)
-    return inverse.T @ inverse
+def leave_one_out(prior: np.ndarray, noise: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Exact leave-one-out residuals [centre, wavelength]: with C the inverse of prior plus noise, (C r)_i / C_ii."""
+    lower = lower_inverse(prior, noise)
+    return scipy.linalg.blas.dsymm(1.0, lower, residual, lower=1) / np.diag(lower)[:, None]
 
 
 def leave_group_out(inverse: np.ndarray, dual: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -91,8 +88,8 @@ def choose_smoothing(centres: Centres, residual: np.ndarray, number: np.ndarray,
     used = number > 0
 
     def score(name: str, level: float) -> float:
-        prior = centres.prior(mode_variance(PRIORS[name], CONSTANT))
-        out = np.asarray(leave_one_out(prior, jnp.asarray(noise_of(level, number)), jnp.asarray(residual)))
+        prior = np.asarray(centres.prior(mode_variance(PRIORS[name], CONSTANT)))
+        out = leave_one_out(prior, noise_of(level, number), residual)
         left_out[name, level] = out
         value = float(np.mean(np.sqrt(np.abs(out[used]))) ** 2)
         curve.append((name, level, value if np.isfinite(value) else np.inf))
