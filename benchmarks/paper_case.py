@@ -34,7 +34,7 @@ def main(materials: list[str]) -> None:
     from sbrdf_jax.resampling import resample
 
     for material in materials:
-        options = resolve(parse_config(f"input:\n  path: builtin:{material}\n"))
+        options = resolve(parse_config(f"input: {{path: builtin:{material}}}\nresample: {{method: paper}}\n"))
         raw = read(options.input.path, options.input)
         ready = prepare(raw, options)
         gridded = resample(ready.cleaned.samples, ready.grid, options.resample)

@@ -174,7 +174,7 @@ def error_table(result: RunResult) -> Table:
 
 def validation_table(result: RunResult) -> Table:
     """Scores of held-out predictions, over everything and by half angle, for each way of holding out."""
-    rows = []
+    rows, covered = [], []
     for group, name in (("", "folds, {} fits"), (f"{LEAVE_ONE_OUT}/", "one theta_i out, {} fits")):
         if f"{group}scores/count" not in result.validation:
             continue
@@ -184,8 +184,13 @@ def validation_table(result: RunResult) -> Table:
         for k in range(len(lower)):
             cells = _score_cells(result.validation, f"{group}half_angle", k)
             rows.append((f"  half angle {lower[k]:g} to {upper[k]:g} deg", *cells))
+        if f"{group}scores/coverage" in result.validation:
+            share = 100 * float(result.validation[f"{group}scores/coverage"])
+            covered.append(f"{share:.1f} % of {name.format(num_fits)}")
     header = ("held out", "samples", *(title for _, title, _ in SCORE_COLUMNS))
     note = "median and 90th: of |error| / value above 1e-3; calm L2: without the 5 % of rows of most energy"
+    if covered:
+        note += f"; within one expected error (68 % is honest): {', '.join(covered)}"
     return Table("Held-out predictions", header, tuple(rows), note, True)
 
 

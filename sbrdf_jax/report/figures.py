@@ -65,8 +65,7 @@ def draw(result: RunResult, folder: Path, samples: RawSamples | None = None, *, 
 
 
 def _sketches(result: RunResult, samples: RawSamples | None) -> Iterator[_Sketch]:
-    # other methods are not the interpolation of their nodes
-    if result.gridded.method == "paper" and finite_wavelengths(result.gridded).size:
+    if finite_wavelengths(result.gridded).size:
         yield from _of_interpolation(result, samples)
     if result.field is not None:
         yield _spectra(result, result.field)
@@ -81,7 +80,7 @@ def _sketches(result: RunResult, samples: RawSamples | None) -> Iterator[_Sketch
 def _of_interpolation(result: RunResult, samples: RawSamples | None) -> Iterator[_Sketch]:
     grid = result.gridded
     fine = interpolate_finely(grid)
-    effect = ring_effect(grid, fine)
+    effect = ring_effect(grid, fine) if grid.field is None else None
     yield _Sketch(
         "plane_of_incidence",
         curves.plane_of_incidence(fine, grid, samples),
@@ -89,25 +88,28 @@ def _of_interpolation(result: RunResult, samples: RawSamples | None) -> Iterator
         f"The resampled BRDF at {fine.wavelength.text} (the paper's figure 7): interpolation, nodes of the grid and, "
         "where there are any at these incident angles, the samples beside the plane.",
     )
-    numbers = (
-        f"Total variation over the hemisphere at {fine.incidences[0].text} incidence: {effect.plain:.4g} rad/sr "
-        f"without the window and {effect.windowed:.4g} rad/sr with it; straight lines between the nodes have "
-        f"{effect.nodes:.4g}."
-    )
+    what, numbers = "The resampled field, read off itself.", ""
+    if effect is not None:
+        what = "The interpolated field without and with the window of eq. 17 (the paper's figures 8 and 9)."
+        numbers = (
+            f"Total variation over the hemisphere at {fine.incidences[0].text} incidence: {effect.plain:.4g} rad/sr "
+            f"without the window and {effect.windowed:.4g} rad/sr with it; straight lines between the nodes have "
+            f"{effect.nodes:.4g}."
+        )
     if np.isfinite(fine.windowed).all():  # else no wavelength is visible
         yield _Sketch(
             "color_maps",
             hemisphere.color_maps(fine, grid, effect),
             "In colour",
-            "The interpolated field without and with the window of eq. 17 (the paper's figures 8 and 9). Each incident "
-            f"angle has one exposure for both; at 1 × a perfect diffuser is white. {numbers}",
+            f"{what} Each incident angle has one exposure; at 1 × a perfect diffuser is white. {numbers}".rstrip(),
         )
-    yield _Sketch(
-        "ring_effect",
-        curves.ring_curves(fine, grid, effect),
-        "The ring effect",
-        f"Eq. 5 with and without the window, through the same nodes. {numbers}",
-    )
+    if effect is not None:
+        yield _Sketch(
+            "ring_effect",
+            curves.ring_curves(fine, grid, effect),
+            "The ring effect",
+            f"Eq. 5 with and without the window, through the same nodes. {numbers}",
+        )
     if result.field is not None and result.compact is not None:
         degrees = tuple(dict.fromkeys((1, result.compact.max_degree)))
         fits = fit_lobe_kinds(result.field, grid, fine.incidences[0].index, degrees)

@@ -79,17 +79,20 @@ def interpolate_finely(gridded: GriddedBRDF, num_theta: int = 181, num_phi: int 
     of the nodes: four channels in place of all wavelengths.
 
     Args:
-        gridded: A grid of method "paper", finite at one wavelength at least.
+        gridded: A grid that is finite at one wavelength at least.
         num_theta: Points from 0 to 90 degrees.
         num_phi: Points from 0 to 360 degrees, odd so that 180 is one of them.
 
     Returns:
-        The interpolation under the grid's window and under none.
+        The interpolation under the grid's window and under none; for a field of its own, that field as both.
     """
     solved = finite_wavelengths(gridded)
     wavelength_nm = np.asarray(gridded.wavelength_nm)[solved]
     wavelength = pick_wavelength(wavelength_nm)
     incidences = pick_incidences(gridded)
+    chosen = wavelength._replace(index=int(solved[wavelength.index]))
+    if gridded.field is not None:
+        return _evaluate_finely(gridded, incidences, chosen, solved)
     brdf = np.asarray(gridded.brdf)[..., solved]
     matching = colour.colour_matching(wavelength_nm)
     channels = np.concatenate(
@@ -103,9 +106,18 @@ def interpolate_finely(gridded: GriddedBRDF, num_theta: int = 181, num_phi: int 
         )
         for window in ("none", gridded.window)
     )
-    return FineGrid(
-        incidences, theta_o, phi_o, wavelength._replace(index=int(solved[wavelength.index])), windowed, plain
-    )
+    return FineGrid(incidences, theta_o, phi_o, chosen, windowed, plain)
+
+
+def _evaluate_finely(
+    gridded: GriddedBRDF, incidences: list[Picked], wavelength: Picked, solved: np.ndarray, num: int = 91
+) -> FineGrid:
+    theta_o, phi_o = np.linspace(0, np.pi / 2, num), np.linspace(0, 2 * np.pi, num)
+    value = evaluate_on_axes(gridded, np.array([p.value for p in incidences]), theta_o, phi_o)
+    matching = colour.colour_matching(np.asarray(gridded.wavelength_nm)[solved])
+    linear = colour.brdf_to_srgb(value[..., solved], matching, gamma=False)
+    channels = np.concatenate([value[..., wavelength.index, None], linear], axis=-1)
+    return FineGrid(incidences, theta_o, phi_o, wavelength, channels, channels)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -44,32 +44,40 @@ def encode_srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
 
 
-def color_maps(fine: FineGrid, gridded: GriddedBRDF, effect: RingEffect) -> Any:
-    """Figures 8 and 9: the interpolated BRDF as sRGB under D65, without and with the window, at the paper's incidences.
+def color_maps(fine: FineGrid, gridded: GriddedBRDF, effect: RingEffect | None) -> Any:
+    """Figures 8 and 9: the resampled BRDF as sRGB under D65 at the paper's incidences.
+
+    Of method paper without and with the window; a field of its own (no `effect`) is one row.
 
     One exposure for each incident angle, so that its two maps compare; it is written below them.
     """
     columns = len(fine.incidences)
-    figure = new_figure(width=2.65 * columns + 0.9, height=6.0)
-    panels = figure.subplots(2, columns, squeeze=False)
+    stages = (fine.windowed,) if effect is None else (fine.plain, fine.windowed)
+    figure = new_figure(width=2.65 * columns + 0.9, height=3.0 * len(stages) + 0.3)
+    panels = figure.subplots(len(stages), columns, squeeze=False)
     for k, incidence in enumerate(fine.incidences):
         # white is the brightest hundredth of the map: the diffuser's white would leave most materials black
         white = max(float(np.quantile(fine.windowed[k, :, :, 1:].max(axis=-1), 0.99)), 1e-12)
-        for axes, values in zip(panels[:, k], (fine.plain, fine.windowed), strict=True):
+        for axes, values in zip(panels[:, k], stages, strict=True):
             image = disk_image(values[k, :, :, 1:] / white)
             outside = np.isnan(image[..., :1])
             opaque = np.concatenate([encode_srgb(np.where(outside, 1.0, image)), 1.0 - outside], axis=-1)
             axes.imshow(opaque, extent=(-90, 90, -90, 90), origin="lower", interpolation="bilinear")
             hemisphere_axes(axes, incidence.value)
         panels[0, k].set_title(f"$\\theta_i$ = {incidence.text}", loc="center")
-        panels[1, k].text(0, -104, f"exposure {1 / white:.2g} ×", ha="center", va="top", fontsize=8.5, color=MUTED)
+        panels[-1, k].text(0, -104, f"exposure {1 / white:.2g} ×", ha="center", va="top", fontsize=8.5, color=MUTED)
+    title = "{} BRDF in colour (sRGB, D65), seen from above; mirror side to the right"
+    legend = "○ incidence, + mirror direction; circles at 30°, 60°, 90°"
+    if effect is None:
+        figure.suptitle(title.format("Resampled"), fontweight="bold")
+        figure.supxlabel(legend, fontsize=9)
+        return figure
     window = {"none": "window: none (as above)"}.get(gridded.window, f"window: {gridded.window}")
     for axes, text in zip(panels[:, 0], ("no window", window), strict=True):
         axes.text(-104, 0, text, rotation=90, ha="right", va="center", fontsize=10.5, fontweight="bold")
-    title = "Interpolated BRDF in colour (sRGB, D65), seen from above; mirror side to the right"
-    figure.suptitle(title, fontweight="bold")
+    figure.suptitle(title.format("Interpolated"), fontweight="bold")
     figure.supxlabel(
-        f"○ incidence, + mirror direction; circles at 30°, 60°, 90°.  Total variation at {fine.incidences[0].text}, "
+        f"{legend}.  Total variation at {fine.incidences[0].text}, "
         f"nodes = 1:  {effect.ratio(effect.plain):.2f} without, {effect.ratio(effect.windowed):.2f} with window",
         fontsize=9,
     )

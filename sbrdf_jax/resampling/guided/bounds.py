@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sbrdf_jax.nnls import DenseNormal, ProjectedNewton, solve_nnls
+from sbrdf_jax.records import Status
 from sbrdf_jax.resampling.guided.smoothing import PADDING_NOISE
 
 
@@ -23,13 +24,14 @@ class Bounded(NamedTuple):
 
     dual: jax.Array  # [centre, wavelength] (K + N)^-1 (r + N v)
     multiplier: jax.Array  # [centre, wavelength] N^1/2 v
-    kkt_residual: jax.Array  # [wavelength]
+    kkt_residual: jax.Array  # [wavelength] of the bounded problem, and of the linear system under it
     num_steps: jax.Array  # [wavelength]
     status: jax.Array  # [wavelength]
 
 
 @functools.partial(jax.jit, static_argnames="method")
 def solve_bounded(
+    prior: Float[Array, "centre centre"],
     inverse: Float[Array, "centre centre"],
     noise: Float[Array, " centre"],
     residual: Float[Array, "centre wavelength"],
@@ -39,7 +41,8 @@ def solve_bounded(
     """Solve for the dual coefficients of the field with z >= 0 at the centres.
 
     Args:
-        inverse: (K + N)^-1, K the prior covariance.
+        prior: K, the prior covariance.
+        inverse: (K + N)^-1.
         noise: Diagonal of N; a centre without samples has `PADDING_NOISE`, and no bound.
         residual: r, z minus the lobe model's.
         model: z of the lobe model.
@@ -52,5 +55,11 @@ def solve_bounded(
     unbounded = model + residual - (root**2)[:, None] * free
     rhs = jnp.where(is_bound[:, None], -unbounded / jnp.where(is_bound, root, 1.0)[:, None], 0.0)
     found = solve_nnls(DenseNormal(covariance), rhs, method)
-    dual = inverse @ (residual + root[:, None] * found.value)
-    return Bounded(dual, found.value, found.residual, found.num_steps, found.status)
+    raised = residual + root[:, None] * found.value
+    dual = inverse @ raised
+    # what the linear system is left with, beside what the bound is left with
+    misfit = jnp.max(jnp.abs(prior @ dual + noise[:, None] * dual - raised), axis=0)
+    size = jnp.max(jnp.abs(raised), axis=0)
+    kkt_residual = jnp.maximum(found.residual, misfit / jnp.where(size > 0, size, 1.0))
+    status = jnp.where(kkt_residual <= method.tolerance, found.status, jnp.maximum(found.status, int(Status.MAX_STEPS)))
+    return Bounded(dual, found.value, kkt_residual, found.num_steps, status)

@@ -84,11 +84,12 @@ def fit_guided(
     factor = np.ones(centres.count)
     factor[seen] = noise_factors(half[seen], *centres.angles[:2, seen], choice.left_out[seen])
     noise = np.where(seen, noise_of(choice.noise, number) * factor, PADDING_NOISE)
-    inverse = invert(np.asarray(centres.prior(choice.variance)), noise)
+    prior = centres.prior(choice.variance)
+    inverse = invert(np.asarray(prior), noise)
 
     say("bounded least squares")
     arrays = (jnp.asarray(a) for a in (noise, residual, model))
-    bounded = solve_bounded(jnp.asarray(inverse), *arrays, ProjectedNewton(tolerance=tolerance))
+    bounded = solve_bounded(prior, jnp.asarray(inverse), *arrays, ProjectedNewton(tolerance=tolerance))
     half_nodes, azimuth_nodes = node_values(choice.variance, centres.features, bounded.dual)
 
     say("error scale")
