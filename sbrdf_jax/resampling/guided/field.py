@@ -22,7 +22,6 @@ from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
 from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, interpolate
 
 DIRECTIONS_AT_A_TIME = 1024
-SMALLEST_VARIANCE = 1e-6  # of z, relative to the prior's: what float32 can tell from nothing
 
 
 @pytree()
@@ -103,17 +102,13 @@ def evaluate_with_error(
     centres = group_coordinates(field.centre, field.theta_limit)
     features = group_features(centres)
     prior = covariance(field.variance, flatten(centres), features)
-    factor = jnp.linalg.cholesky(prior + jnp.diag(field.noise.reshape(-1))).astype(jnp.float32)
-    variance_32, features_32 = jax.tree.map(lambda x: x.astype(jnp.float32), (field.variance, features))
+    factor = jnp.linalg.cholesky(prior + jnp.diag(field.noise.reshape(-1)))
 
     def of_chunk(angles):
         at = guided_coordinates(*angles, field.theta_limit)
         z = each_direction(lambda place: _log_value(field, place), at)
-        at_32 = jax.tree.map(lambda x: x.astype(jnp.float32), at)
-        cross = covariance(variance_32, at_32, features_32)
-        root = jax.scipy.linalg.solve_triangular(factor, cross.T, lower=True)
-        explained = jnp.sum(root**2, axis=0).astype(z.dtype)
-        variance = jnp.maximum(prior_variance(field.variance, at) - explained, SMALLEST_VARIANCE)
+        root = jax.scipy.linalg.solve_triangular(factor, covariance(field.variance, at, features).T, lower=True)
+        variance = jnp.maximum(prior_variance(field.variance, at) - jnp.sum(root**2, axis=0), 0.0)
         unit = residual_scale(field.scale, at.theta_i, at.half, z) * slope(z, at, field.floor)
         value = from_log(z, at.theta_i, field.floor)
         return jnp.stack([value, unit * jnp.sqrt(variance)[:, None], unit * jnp.sqrt(field.noise_level)], axis=1)
