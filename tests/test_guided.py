@@ -17,6 +17,7 @@ from sbrdf_jax.grid import make_grid
 from sbrdf_jax.nnls import ProjectedNewton
 from sbrdf_jax.options import GridOptions, InputOptions, ResampleOptions
 from sbrdf_jax.records import RawSamples, Status
+from sbrdf_jax.report import draw_figures
 from sbrdf_jax.resampling.guided import fit_field, place_centres, resample_guided
 from sbrdf_jax.resampling.guided.bounds import solve_bounded
 from sbrdf_jax.resampling.guided.coordinates import from_log, guided_coordinates, to_log
@@ -27,7 +28,7 @@ from sbrdf_jax.resampling.guided.merging import merge_samples
 from sbrdf_jax.resampling.guided.nodes import GRIDS, interpolate, mirror, mode_variance
 from sbrdf_jax.resampling.guided.smoothing import CONSTANT, PRIORS, invert, leave_group_out, leave_one_out
 from sbrdf_jax.scores import coverage, held_out_scores
-from sbrdf_jax.store import load_stage
+from sbrdf_jax.store import load, load_stage
 from sbrdf_jax.validation import predict_held_out
 
 LIMIT = jnp.asarray(np.deg2rad([85.0, 85.0]))
@@ -338,6 +339,10 @@ def test_a_result_holds_the_field_and_its_errors(samples, tmp_path, rng):
     nodes = np.meshgrid(stage.theta_i, stage.theta_o, stage.phi_o, indexing="ij")
     np.testing.assert_allclose(evaluate_in_chunks(stage, *nodes), stage.brdf, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(evaluate_standard_error(stage, *nodes)[0], stage.standard_error, rtol=1e-6)
+    (tmp_path / "figures").mkdir()
+    without_compact = dataclasses.replace(load(path), field=None, compact=None, metrics={})
+    names = [figure.name for figure in draw_figures(without_compact, tmp_path / "figures")]
+    assert names[:3] == ["plane_of_incidence.png", "color_maps.png", "held_out.png"]  # no rings without eq. (5)
     (tmp_path / "at.csv").write_text("theta_i_deg,theta_o_deg,phi_o_deg\n30,45,90\n12,7,200\n")
     words = ["evaluate", str(path), "--at", str(tmp_path / "at.csv"), "--stage", "grid", "--uncertainty"]
     assert main([*words, "--output", str(tmp_path / "values.csv")]) == 0

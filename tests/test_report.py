@@ -151,7 +151,8 @@ def test_drawing_leaves_no_trace_and_is_reproducible(plain, tmp_path):
     assert dict(matplotlib.rcParams) == before
     pyplot = sys.modules.get("matplotlib.pyplot")  # colour-science imports it; this project never does
     assert pyplot is None or pyplot.get_fignums() == []
-    assert [path.name for path in first] == [path.name for path in second] == ["coverage.png", "solver.png"]
+    names = ["plane_of_incidence.png", "color_maps.png", "ring_effect.png", "coverage.png", "solver.png"]
+    assert [path.name for path in first] == [path.name for path in second] == names
     assert all(a.read_bytes() == b.read_bytes() for a, b in zip(first, second, strict=True))
 
 

@@ -208,7 +208,8 @@ def test_wrong_command_is_one_line(case, folder, tmp_path, capsys, monkeypatch):
 def test_no_positive_value_is_refused(folder, tmp_path, capsys):
     samples = scattered_samples(np.random.default_rng(3), [0.0, 30.0, 60.0], 60, 9)
     write_samples(tmp_path / "dark.h5", dataclasses.replace(samples, value=-np.abs(samples.value)))
-    assert main(["run", str(folder / "config.yaml"), f"input.path={tmp_path / 'dark.h5'}", *FAST]) == 2
+    places = [f"input.path={tmp_path / 'dark.h5'}", f"output.path={tmp_path / 'out.h5'}"]
+    assert main(["run", str(folder / "config.yaml"), *places, *FAST]) == 2
     _assert_one_line(capsys, "no positive value")
 
 
