@@ -47,6 +47,11 @@ def main() -> None:
         for scheme, found, seconds in scores_of(file, folds, args.method, leave_one_out=is_cornell):
             values = "".join(f"{float(found.get(f'scores/{column}', float('nan'))):>15.4f}" for column in COLUMNS)
             print(f"{name:<12} {scheme:<8}{values}{seconds:>10.1f}", flush=True)
+            for split in ("theta_i", "decade"):
+                if f"coverage_by_{split}/share" in found:
+                    label, share = (found[f"coverage_by_{split}/{part}"] for part in ("label", "share"))
+                    pairs = "  ".join(f"{a:.3g}: {b:.2f}" for a, b in zip(label, share, strict=True))
+                    print(f"{'':<12} coverage by {split}: {pairs}")
             row = best.get((scheme, name), {})
             print(f"{'':<12} {'others':<8}" + "".join(f"{row[c]:>15.4f}" if c in row else f"{'':>15}" for c in COLUMNS))
 

@@ -58,26 +58,19 @@ def write_mapping(group: h5py.Group, mapping: Mapping[str, Any], units: str) -> 
 
 
 def group_of(group: h5py.Group, name: str) -> h5py.Group:
-    """Return a group below a group.
-
-    Raises:
-        ValueError: it is something else.
-    """
-    found = group[name]
-    if not isinstance(found, h5py.Group):
-        raise ValueError(f"{group.name}/{name}: expected a group")
-    return found
+    """Return a group below a group; ValueError where it is something else."""
+    return _item_of(group, name, h5py.Group)
 
 
 def dataset_of(group: h5py.Group, name: str) -> h5py.Dataset:
-    """Return a dataset below a group.
+    """Return a dataset below a group; ValueError where it is something else."""
+    return _item_of(group, name, h5py.Dataset)
 
-    Raises:
-        ValueError: it is something else.
-    """
+
+def _item_of(group: h5py.Group, name: str, kind: type) -> Any:
     found = group[name]
-    if not isinstance(found, h5py.Dataset):
-        raise ValueError(f"{group.name}/{name}: expected a dataset")
+    if not isinstance(found, kind):
+        raise ValueError(f"{group.name}/{name}: expected a {kind.__name__.lower()}")
     return found
 
 

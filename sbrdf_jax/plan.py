@@ -7,10 +7,8 @@ from sbrdf_jax.folds import Folds
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.options import RunOptions
 from sbrdf_jax.records import RawSamples
-from sbrdf_jax.resampling.normal import Layout
 
 CRITICAL_ANGLES = 21
-BYTES = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,9 +40,13 @@ def plan_run(kept: RawSamples, num_read: int, grid: Grid, coefficients: int, opt
     lanes = len(grid.theta_i) * coefficients
     kinds = 3 if options.represent.lobe == "best" else 1
     folded = "phi_o folded, poles tied" if grid.bilateral else "poles tied, 360 degrees = 0"
+    solved = PlanRow("resample", "unknowns", grid.num_unknowns, nodes, folded)
+    if options.resample.method == "guided":
+        distinct = len(grid.theta_i) * len(grid.theta_o) * grid.num_azimuths
+        solved = PlanRow("resample", "nodes", distinct, nodes, "phi_o folded; read off the fitted field")
     return [
         PlanRow("clean", "samples", kept.num_samples, num_read, "what is dropped is listed by reason"),
-        PlanRow("resample", "unknowns", grid.num_unknowns, nodes, folded),
+        solved,
         PlanRow("resample", "wavelengths", wavelengths, wavelengths, "no scene: every wavelength"),
         PlanRow("encode", "coefficients", coefficients, wavelengths, f"basis {options.encode.basis}"),
         PlanRow("represent", "lanes", lanes, lanes, "incident angles x coefficients"),
@@ -62,13 +64,6 @@ def plan_validation(schemes: Mapping[str, Folds]) -> list[PlanRow]:
     """Count the fits of held-out validation, a row per scheme: each is a resampling of its own."""
     counts = {name: len(folds.labels) for name, folds in schemes.items()}
     return [PlanRow("validate", name, counts[name], counts[name], folds.how) for name, folds in schemes.items()]
-
-
-def resample_bytes(grid: Grid, num_samples: int, num_groups: int, wavelengths: int) -> int:
-    """Predict the memory of the resampling: the Kronecker sum's blocks and the solver's arrays [bytes]."""
-    layout = Layout.of(grid)
-    terms = min(num_groups, layout.num_theta_i**2)
-    return BYTES * (terms * layout.num_directions**2 + 12 * grid.num_unknowns * wavelengths + num_samples * wavelengths)
 
 
 def plan_text(rows: list[PlanRow]) -> str:

@@ -125,7 +125,7 @@ def test_covariance_and_nodes_equal_dense_matrices(rng):
     angles[0] = jnp.repeat(jnp.asarray([0.2, 0.5, 1.1]), 8)
     samples = RawSamples(*map(np.asarray, angles), np.array([500.0]), np.ones((24, 1)), np.arange(24), *"abcd")
     centres = place_centres(samples)
-    seen = np.flatnonzero(~centres.is_padding)
+    seen = np.flatnonzero(centres.number > 0)
     at = guided_coordinates(*random_directions(rng, 9), jnp.asarray(centres.theta_limit))
     expected, own = np.zeros((9, len(seen))), np.zeros(9)
     for name in GRIDS:

@@ -164,7 +164,7 @@ def _of_samples(result: RunResult, samples: RawSamples | None) -> Iterator[_Sket
         hemisphere.coverage_maps(result.gridded),
         "Coverage",
         "Nodes with a sample within one step, nodes between samples, and nodes beyond the measured range, where the "
-        "values are extrapolated by the smoothness rows alone.",
+        "values are extrapolated.",
     )
     spectra = [] if samples is None else measure_samples(samples, result.gridded)
     if spectra:

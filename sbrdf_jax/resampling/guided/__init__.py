@@ -98,10 +98,8 @@ def read_nodes(field: GuidedField, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
 
     The field is even in azimuth, so half of the circle is evaluated.
     """
-    half = grid.num_phi_o // 2
-    circle = np.arange(grid.num_phi_o + 1) % grid.num_phi_o
-    distinct = np.minimum(circle, grid.num_phi_o - circle)
-    angles = np.meshgrid(grid.theta_i, grid.theta_o, grid.phi_o[: half + 1], indexing="ij")
+    distinct = np.append(grid.azimuth_index, 0)
+    angles = np.meshgrid(grid.theta_i, grid.theta_o, grid.phi_o[: grid.num_azimuths], indexing="ij")
     shape = (*angles[0].shape, -1)
     flat = [jnp.asarray(a.reshape(-1)) for a in angles]
     value, error, _ = (np.asarray(a).reshape(shape)[:, :, distinct] for a in evaluate_with_error(field, *flat))

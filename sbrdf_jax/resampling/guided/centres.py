@@ -32,8 +32,6 @@ class Centres:
 
     row: np.ndarray  # [sample] rows of the file, increasing
     index: np.ndarray  # [sample] centre of each sample
-    group: np.ndarray  # [centre] incident angle's number
-    is_padding: np.ndarray  # [centre]
     at: Coordinates  # [centre]
     snapped: Coordinates  # [centre] each group at one incident angle
     angles: np.ndarray  # [3, centre] theta_i, theta_o, folded azimuth [rad]
@@ -44,7 +42,7 @@ class Centres:
     @property
     def count(self) -> int:
         """Centres, padding included."""
-        return len(self.group)
+        return self.angles.shape[1]
 
     def prior(self, variance: ModeVariance) -> jax.Array:
         """Prior covariance [centre, centre], computed once for each smoothness."""
@@ -87,14 +85,10 @@ def place_centres(samples: RawSamples) -> Centres:
     angles = np.full((3, groups * members), 0.5)
     angles[0] = np.repeat(incidence, members)
     angles[:, position] = mean
-    is_padding = np.ones(groups * members, bool)
-    is_padding[position] = False
     grouped = group_coordinates(jnp.asarray(angles.reshape(3, groups, members)), jnp.asarray(limit))
     return Centres(
         row=samples.row,
         index=position[cell],
-        group=np.repeat(np.arange(groups), members),
-        is_padding=is_padding,
         at=guided_coordinates(*(jnp.asarray(a) for a in angles), jnp.asarray(limit)),
         snapped=flatten(grouped),
         angles=angles,

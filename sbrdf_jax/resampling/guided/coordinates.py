@@ -18,6 +18,7 @@ from sbrdf_jax.records import pytree
 COS_FLOOR = float(np.cos(np.deg2rad(85.0)))  # every cosine that divides or weighs is at least this
 EXTRAPOLATION = np.deg2rad(10.0)  # beyond the measured range the field goes on so far, then stays
 POLE_BLEND = 0.005  # sin(theta_i) sin(theta_o) at which the azimuth has half of its effect
+LARGEST_Z = 80.0  # an exponential of more would be of no use to anyone
 
 
 @pytree()
@@ -59,7 +60,7 @@ def guided_coordinates(
     normal = jnp.cos(theta_i) + jnp.cos(theta_o)
     theta_h = jnp.arctan2(jnp.sqrt(tangential2 + 1e-24), normal)
     cos_difference = jnp.sqrt(tangential2 + normal**2) / 2
-    blend = azimuth_share(theta_i, theta_o)
+    blend = sin_i * sin_o / (sin_i * sin_o + POLE_BLEND)
     return Coordinates(
         half=jnp.log1p(jnp.rad2deg(theta_h)),
         azimuth=np.pi / 2 + (azimuth - np.pi / 2) * blend,
@@ -68,12 +69,6 @@ def guided_coordinates(
         tan2_half=tangential2 / jnp.maximum(normal, 1e-3) ** 2,
         cos_difference=jnp.clip(cos_difference, 0.0, 1.0),
     )
-
-
-def azimuth_share(theta_i: Float[Array, "*shape"], theta_o: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """How much of the azimuth counts: 0 at either pole, nearly 1 away from them."""
-    product = jnp.sin(theta_i) * jnp.sin(theta_o)
-    return product / (product + POLE_BLEND)
 
 
 def floored_cos(theta: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -98,4 +93,12 @@ def from_log(
     z: Float[Array, "*shape wavelength"], theta_i: Float[Array, "*shape"], floor: Float[Array, ""]
 ) -> Float[Array, "*shape wavelength"]:
     """Inverse of `to_log`; never negative, because a z below 0 counts as 0."""
-    return floor * jnp.expm1(jnp.clip(z, 0.0, 80.0)) / jnp.sqrt(floored_cos(theta_i))[..., None]
+    return floor * jnp.expm1(jnp.clip(z, 0.0, LARGEST_Z)) / jnp.sqrt(floored_cos(theta_i))[..., None]
+
+
+@jax.jit
+def slope(
+    z: Float[Array, "*shape wavelength"], theta_i: Float[Array, "*shape"], floor: Float[Array, ""]
+) -> Float[Array, "*shape wavelength"]:
+    """Derivative of `from_log` by z [1/sr]; where z is below 0, that at 0."""
+    return floor * jnp.exp(jnp.clip(z, 0.0, LARGEST_Z)) / jnp.sqrt(floored_cos(theta_i))[..., None]

@@ -50,18 +50,16 @@ def flatten(at: Coordinates) -> Coordinates:
     return jax.tree.map(lambda x: x.reshape(-1), at)
 
 
-def _along_theta_i(variance, first, second):
-    """Sum over the modes of theta_i: [direction, group, other mode]."""
-    flat = jnp.moveaxis(jnp.asarray(variance), 1, 0).reshape(variance.shape[1], -1)
-    pairs = first[:, None, :] * second[None, :, :]
-    return pairs @ flat
+def _by_theta_i(variance):
+    """Variances of one grid's modes as [mode of theta_i, other mode], the order of the features."""
+    return jnp.moveaxis(jnp.asarray(variance), 1, 0).reshape(variance.shape[1], -1)
 
 
 def _covariance(variance: ModeVariance, left: Features, right: GroupedFeatures):
     total = 0.0
     for name in GRIDS:
-        weight = _along_theta_i(getattr(variance, name), left.theta_i, right.theta_i)
-        weighted = weight * getattr(left, name)[:, None, :]
+        pairs = left.theta_i[:, None, :] * right.theta_i[None, :, :]  # [direction, group, mode]
+        weighted = (pairs @ _by_theta_i(getattr(variance, name))) * getattr(left, name)[:, None, :]
         total = total + jnp.einsum("dgf,gmf->dgm", weighted, getattr(right, name))
     return total.reshape(left.theta_i.shape[0], -1)
 
@@ -87,9 +85,8 @@ def prior_variance(variance: ModeVariance, at: Coordinates) -> Float[Array, " di
     features = features_of(at)
     total = jnp.zeros_like(at.theta_i)
     for name in GRIDS:
-        part = getattr(variance, name)
-        flat = jnp.moveaxis(jnp.asarray(part), 1, 0).reshape(part.shape[1], -1)
-        total = total + jnp.sum((features.theta_i**2 @ flat) * getattr(features, name) ** 2, axis=1)
+        weight = features.theta_i**2 @ _by_theta_i(getattr(variance, name))
+        total = total + jnp.sum(weight * getattr(features, name) ** 2, axis=1)
     return total
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sbrdf_jax.records import pytree
-from sbrdf_jax.resampling.guided.coordinates import Coordinates, floored_cos, from_log, guided_coordinates
+from sbrdf_jax.resampling.guided.coordinates import Coordinates, from_log, guided_coordinates, slope
 from sbrdf_jax.resampling.guided.covariance import (
     covariance,
     flatten,
@@ -109,14 +109,9 @@ def evaluate_with_error(
         z = each_direction(lambda place: _log_value(field, place), at)
         root = jax.scipy.linalg.solve_triangular(factor, covariance(field.variance, at, features).T, lower=True)
         variance = jnp.maximum(prior_variance(field.variance, at) - jnp.sum(root**2, axis=0), 0.0)
-        unit = residual_scale(field.scale, at.theta_i, at.half, z) * slope(z, at, field.floor)
+        unit = residual_scale(field.scale, at.theta_i, at.half, z) * slope(z, at.theta_i, field.floor)
         value = from_log(z, at.theta_i, field.floor)
         return jnp.stack([value, unit * jnp.sqrt(variance)[:, None], unit * jnp.sqrt(field.noise_level)], axis=1)
 
     found = in_chunks(of_chunk, (theta_i, theta_o, phi_o), DIRECTIONS_AT_A_TIME)
     return found[:, 0], found[:, 1], found[:, 2]
-
-
-def slope(z: Float[Array, "direction wavelength"], at: Coordinates, floor) -> Float[Array, "direction wavelength"]:
-    """Derivative of the BRDF by z [1/sr]."""
-    return floor * jnp.exp(jnp.clip(z, 0.0, 80.0)) / jnp.sqrt(floored_cos(at.theta_i))[:, None]

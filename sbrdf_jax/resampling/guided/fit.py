@@ -11,7 +11,7 @@ from sbrdf_jax.nnls import ProjectedNewton
 from sbrdf_jax.records import RawSamples
 from sbrdf_jax.resampling.guided.bounds import solve_bounded
 from sbrdf_jax.resampling.guided.centres import Centres, place_centres
-from sbrdf_jax.resampling.guided.coordinates import floored_cos, from_log, guided_coordinates, to_log
+from sbrdf_jax.resampling.guided.coordinates import from_log, guided_coordinates, slope, to_log
 from sbrdf_jax.resampling.guided.covariance import node_values
 from sbrdf_jax.resampling.guided.error_model import ResidualScale, estimate_floor, fit_residual_scale, noise_factors
 from sbrdf_jax.resampling.guided.field import GuidedField
@@ -130,7 +130,7 @@ def _calibrate(centres: Centres, samples: RawSamples, predicted, spread, floor: 
     centre = centres.index
     z = predicted[centre]
     theta_i = centres.angles[0, centre]
-    value = np.asarray(from_log(jnp.asarray(z), jnp.asarray(theta_i), jnp.asarray(floor)))
-    slope = floor * np.exp(np.clip(z, 0.0, 80.0)) / np.sqrt(np.asarray(floored_cos(jnp.asarray(theta_i))))[:, None]
-    standardised = (np.maximum(samples.value, 0.0) - value) / (slope * np.sqrt(spread[centre])[:, None])
+    arguments = jnp.asarray(z), jnp.asarray(theta_i), jnp.asarray(floor)
+    value, unit = np.asarray(from_log(*arguments)), np.asarray(slope(*arguments))
+    standardised = (np.maximum(samples.value, 0.0) - value) / (unit * np.sqrt(spread[centre])[:, None])
     return fit_residual_scale(theta_i, np.asarray(centres.at.half)[centre], z, standardised)
