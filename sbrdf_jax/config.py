@@ -22,7 +22,6 @@ NOT_YET: dict[str, tuple[Callable[[Any], bool], str]] = {
         lambda value: value in ("rgl-bsdf", "merl", "astm", "pab", "inplane", "alta"),
         "auto, pbrt, csv, hdf5, nist",
     ),
-    "grid.reciprocal": (lambda value: value, "false"),
     "encode.basis": (lambda value: value == "data", "auto, fourier, cosine, identity"),
     "represent.method": (lambda value: value in ("lobe_harmonics", "lobe_tensor"), "auto, paper"),
     "scene": (lambda value: value is not None, "null"),
@@ -250,6 +249,8 @@ def _problems(options: RunOptions) -> Iterator[tuple[str, str]]:
         yield "resample.smoothness_weight", "found 0; expected data or a number above 0, because method is guided"
     if method == "guided" and options.input.bilateral is False:
         yield "input.bilateral", "found false; expected auto or true, because method guided folds phi_o"
+    if method == "paper" and options.grid.reciprocal:
+        yield "grid.reciprocal", "found true; expected false, because method paper has no tie between incident angles"
     if options.validate.folds == 1:
         yield "validate.folds", "found 1; expected 0 (off), or 2 or more"
     for key in _ONE_OF:

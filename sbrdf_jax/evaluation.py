@@ -23,6 +23,7 @@ from sbrdf_jax.resampling.guided.field import (
     each_direction,
     evaluate_direction,
     evaluate_with_error,
+    field_whitener,
 )
 from sbrdf_jax.sinc import Window, azimuth_distance, polar_distance, separable_weights
 
@@ -315,7 +316,8 @@ def evaluate_standard_error(
     if not isinstance(field, GuidedField):
         raise TypeError(f"{type(result).__name__}: its method has no standard error")
     angles = np.broadcast_arrays(*(np.asarray(a, float) for a in (theta_i, theta_o, phi_o)))
-    _, *found = evaluate_with_error(field, *(jnp.asarray(a.reshape(-1)) for a in angles))
+    whiten = jnp.asarray(field_whitener(field))
+    _, *found = evaluate_with_error(field, whiten, *(jnp.asarray(a.reshape(-1)) for a in angles))
     both = np.asarray(found).reshape(2, *angles[0].shape, -1)
     if wavelength_nm is not None:
         measured = np.asarray(field.wavelength_nm)

@@ -29,6 +29,7 @@ class Grid:
     num_phi_o: int  # azimuths round the circle, 2 pi not counted again
     bilateral: bool  # phi_o and 2 pi - phi_o are one
     interpolate_theta_i: bool  # False: theta_i are the measured incident angles, nothing between them
+    reciprocal: bool = False  # the field is tied by Helmholtz reciprocity
 
     @property
     def phi_o(self) -> np.ndarray:
@@ -115,6 +116,7 @@ def make_grid(samples: RawSamples, options: GridOptions, *, bilateral: bool) -> 
         num_phi_o=2 * round(180 / options.phi_o_step_deg),
         bilateral=bilateral,
         interpolate_theta_i=interpolate,
+        reciprocal=options.reciprocal,
     )
 
 

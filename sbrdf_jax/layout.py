@@ -21,7 +21,6 @@ from sbrdf_jax.resampling.guided.error_model import ResidualScale
 from sbrdf_jax.resampling.guided.field import GuidedField
 from sbrdf_jax.resampling.guided.lobe_model import SHAPE_NAMES, LobeModel
 from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, mirror
-from sbrdf_jax.resampling.guided.smoothing import PRIORS
 from sbrdf_jax.scores import SCORE_TEXT
 
 GUIDED_PARTS = {"lobe": LobeModel, "variance": ModeVariance, "scale": ResidualScale}
@@ -65,7 +64,7 @@ def write_guided(group: h5py.Group, field: GuidedField) -> None:
     for name in ("theta_limit", "centre"):
         arrays[f"{name}_deg"] = degrees(arrays.pop(name))
     parts = {name: {f: np.asarray(v) for f, v in vars(record[name]).items()} for name in GUIDED_PARTS}
-    write_mapping(group, arrays | parts | {"priors": list(PRIORS), "lobe_shape": list(SHAPE_NAMES)}, "1")
+    write_mapping(group, arrays | parts | {"lobe_shape": list(SHAPE_NAMES)}, "1")
     for name, axes in GRIDS.items():
         for axis, label in zip(axes, (name, "theta_i", "theta_o"), strict=True):
             group[name].attrs[f"{label}_nodes"] = axis.nodes
@@ -165,6 +164,8 @@ def read_guided(group: h5py.Group) -> GuidedField:
     stored = read_mapping(group)
     parts = {name: kind(**stored.pop(name)) for name, kind in GUIDED_PARTS.items()}
     angles = {name: np.deg2rad(stored.pop(f"{name}_deg")) for name in ("theta_limit", "centre")}
+    variance = parts["variance"]
+    parts["variance"] = dataclasses.replace(variance, reciprocal=bool(variance.reciprocal))
     names = {f.name for f in dataclasses.fields(GuidedField)}
     plain = {name: np.asarray(value) for name, value in stored.items() if name in names}
     nodes = {name: mirror(jnp.asarray(plain.pop(name))) for name in GRIDS}

@@ -76,12 +76,12 @@ def predict(
     return Prediction(evaluate_in_chunks(gridded, *angles), np.asarray(gridded.status, int))
 
 
-def share_angles(raw: RawSamples, options: ResampleOptions, bilateral: bool) -> Centres | None:
+def share_angles(raw: RawSamples, grid: Grid, options: ResampleOptions, bilateral: bool) -> Centres | None:
     """Return what fits to parts of a measurement share, because it depends on angles alone; None for method paper."""
     if options.method != "guided":
         return None
     positive = dataclasses.replace(raw, value=np.ones_like(raw.value))  # no row is dropped for its values
-    return place_centres(clean(positive, bilateral=bilateral, method=options.method).samples)
+    return place_centres(clean(positive, bilateral=bilateral, method=options.method).samples, grid.reciprocal)
 
 
 def predict_held_out(
@@ -111,7 +111,7 @@ def predict_held_out(
     """
     labels = folds.labels
     predicted, expected = np.full((2, *raw.value.shape), np.nan)
-    centres = share_angles(raw, options, bilateral)
+    centres = share_angles(raw, grid, options, bilateral)
     status = np.zeros((len(labels), len(raw.wavelength_nm)), int)
     top = np.pi / 2  # above it by rounding, as cleaning clips it
     for number, label in enumerate(labels):

@@ -92,7 +92,6 @@ WRONG_KEYS_AND_VALUES = [
 
 NOT_BUILT = {
     "input.format": ["rgl-bsdf", "merl", "astm", "pab", "inplane", "alta"],
-    "grid.reciprocal": ["true"],
     "encode.basis": ["data"],
     "represent.method": ["lobe_harmonics", "lobe_tensor"],
     "scene": ["{}", "{wavelength_nm: {min: 500, max: 600}}", "{theta_i_deg: [0, 45]}"],

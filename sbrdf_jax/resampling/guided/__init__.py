@@ -14,13 +14,18 @@ from sbrdf_jax.grid import Grid
 from sbrdf_jax.options import ResampleOptions
 from sbrdf_jax.records import GriddedBRDF, RawSamples, Status
 from sbrdf_jax.resampling.extrapolation import extrapolated_nodes
-from sbrdf_jax.resampling.guided.centres import Centres, place_centres
+from sbrdf_jax.resampling.guided.centres import PADDING_NOISE, Centres, place_centres
+from sbrdf_jax.resampling.guided.coordinates import guided_coordinates
 from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_with_error
 from sbrdf_jax.resampling.guided.fit import GuidedFit, fit_guided
-from sbrdf_jax.resampling.guided.smoothing import PADDING_NOISE
+from sbrdf_jax.resampling.guided.lobe_model import lobe_terms
 
 __all__ = ["Centres", "GuidedField", "describe_fit", "fit_field", "place_centres", "resample_guided"]
 
+CONTRADICTED = 1.2  # growth of the left-out errors from which reciprocity is doubted
+MIRROR_TERM = 1  # of the lobe model
+RESOLVED = 4  # directions within the mirror image, for each incident angle, that would tell its shape
+SPIKE_THETA = np.pi / 4  # where the mirror image is compared with the other terms
 DOUBTED = 1.5  # noise variance, relative, of a direction that is said to have lost weight
 
 
@@ -55,6 +60,7 @@ def fit_field(
         kkt_residual=_spread(fit.kkt_residual, live, missing),
         num_steps=num_steps,
         status=status,
+        whiten=fit.whiten,
     )
 
 
@@ -63,6 +69,7 @@ def resample_guided(
     grid: Grid,
     options: ResampleOptions,
     report: Callable[[str], None] | None = None,
+    centres: Centres | None = None,
 ) -> GriddedBRDF:
     """Fit the guided field, and read it and its standard error off at the grid's nodes.
 
@@ -71,9 +78,10 @@ def resample_guided(
         grid: Nodes; bilateral.
         options: As for `fit_field`.
         report: Told of each step.
+        centres: As for `fit_field`.
     """
-    fit = fit_field(samples, options, report)
-    value, error = read_nodes(fit.field, grid)
+    fit = fit_field(samples, options, report, centres or place_centres(samples, grid.reciprocal))
+    value, error = read_nodes(fit.field, grid, fit.whiten)
     return GriddedBRDF(
         theta_i=jnp.asarray(grid.theta_i),
         theta_o=jnp.asarray(grid.theta_o),
@@ -93,26 +101,57 @@ def resample_guided(
     )
 
 
-def read_nodes(field: GuidedField, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+def read_nodes(field: GuidedField, grid: Grid, whiten: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the field and its standard error [theta_i, theta_o, phi_o inclusive, wavelength] at the grid's nodes.
 
     The field is even in azimuth, so half of the circle is evaluated.
+
+    Args:
+        field: The fitted field.
+        grid: Nodes.
+        whiten: Inverse Cholesky factor of prior plus noise, from the fit.
     """
     distinct = np.append(grid.azimuth_index, 0)
-    angles = np.meshgrid(grid.theta_i, grid.theta_o, grid.phi_o[: grid.num_azimuths], indexing="ij")
-    shape = (*angles[0].shape, -1)
-    flat = [jnp.asarray(a.reshape(-1)) for a in angles]
-    value, error, _ = (np.asarray(a).reshape(shape)[:, :, distinct] for a in evaluate_with_error(field, *flat))
+    theta_o, phi_o = (a.reshape(-1) for a in np.meshgrid(grid.theta_o, grid.phi_o[: grid.num_azimuths], indexing="ij"))
+    shape = (len(grid.theta_i), len(grid.theta_o), len(distinct), len(field.wavelength_nm))
+    value, error = np.empty(shape), np.empty(shape)
+    for place, theta_i in enumerate(grid.theta_i):
+        angles = (jnp.asarray(a) for a in (np.full_like(theta_o, theta_i), theta_o, phi_o))
+        found = evaluate_with_error(field, jnp.asarray(whiten), *angles)
+        for whole, part in zip((value, error), found, strict=False):  # the noise of one measurement is not kept
+            whole[place] = np.asarray(part).reshape(shape[1], -1, shape[3])[:, distinct]
     return value, error
 
 
 def describe_fit(field: GuidedField) -> tuple[str, ...]:
     """Sentences on what a user should know of a fit."""
+    lines = []
     doubted = int(np.sum(np.asarray(field.noise_factor) > DOUBTED))
-    total = int(np.sum(np.asarray(field.noise) < PADDING_NOISE))
-    if not doubted:
-        return ()
-    return (f"guided: {doubted} of {total} directions contradict their neighbours and lost weight",)
+    if doubted:
+        total = int(np.sum(np.asarray(field.noise) < PADDING_NOISE))
+        lines.append(f"guided: {doubted} of {total} directions contradict their neighbours and lost weight")
+    cost = float(field.reciprocity_cost)
+    if cost > CONTRADICTED:
+        lines.append(f"grid.reciprocal: the measurement contradicts it, left-out errors grow {cost:.1f} times")
+    lines += describe_spike(field)
+    return tuple(lines)
+
+
+def describe_spike(field: GuidedField) -> list[str]:
+    """Say where the mirror image of the source outshines all else, and too few directions see it to tell its shape."""
+    angle = jnp.asarray(SPIKE_THETA)
+    at = guided_coordinates(angle, angle, jnp.asarray(np.pi), jnp.asarray(field.theta_limit))
+    term = np.asarray(lobe_terms(jnp.asarray(field.lobe.shape), at))[:, None] * np.exp(field.lobe.log_amplitude)
+    spiky = term[MIRROR_TERM] > np.delete(term, MIRROR_TERM, axis=0).sum(axis=0)
+    width = np.rad2deg(np.arctan(np.exp(field.lobe.shape[1])))
+    centres = guided_coordinates(*(jnp.asarray(a) for a in field.centre), jnp.asarray(field.theta_limit))
+    near = (np.expm1(np.asarray(centres.half)) < width) & (np.asarray(field.noise) < PADDING_NOISE)
+    if not spiky.any() or near.sum() >= RESOLVED * len(near):
+        return []
+    return [
+        f"guided: a mirror spike of about {width:.1f} degrees at {spiky.sum()} of {len(spiky)} wavelengths, seen by "
+        f"{near.sum()} directions: too few for its shape; the lobe model alone carries it"
+    ]
 
 
 def _spread(array: np.ndarray, live: np.ndarray, missing: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from sbrdf_jax.nnls import DenseNormal, ProjectedNewton, solve_nnls
 from sbrdf_jax.records import Status
-from sbrdf_jax.resampling.guided.smoothing import PADDING_NOISE
+from sbrdf_jax.resampling.guided.centres import PADDING_NOISE
 
 
 class Bounded(NamedTuple):

@@ -18,12 +18,14 @@ from sbrdf_jax.resampling.guided.covariance import (
     group_coordinates,
     group_features,
 )
+from sbrdf_jax.resampling.guided.inverse import lower_inverse
 from sbrdf_jax.resampling.guided.merging import merge_samples
 from sbrdf_jax.resampling.guided.nodes import ModeVariance
 
 STEEPEST = np.deg2rad(85.0)
 MOST_GROUPS = 45  # more incident angles are sorted into so many bins
 MEMBER_BUCKET = 8  # members of a group are padded to a multiple
+PADDING_NOISE = 1e12  # variance that leaves a centre without effect
 
 
 @dataclasses.dataclass(eq=False)
@@ -37,12 +39,24 @@ class Centres:
     angles: np.ndarray  # [3, centre] theta_i, theta_o, folded azimuth [rad]
     theta_limit: np.ndarray  # [2] rad
     features: GroupedFeatures
+    reciprocal: bool  # nodes are tied by Helmholtz reciprocity
     _prior: dict[int, tuple[ModeVariance, jax.Array]] = dataclasses.field(default_factory=dict)
+    _inverse: dict[tuple[int, float], np.ndarray] = dataclasses.field(default_factory=dict)
 
     @property
     def count(self) -> int:
         """Centres, padding included."""
         return self.angles.shape[1]
+
+    @property
+    def num_groups(self) -> int:
+        """Incident angles, or bins of them."""
+        return self.features.theta_i.shape[0]
+
+    @property
+    def num_members(self) -> int:
+        """Centres of each group, padding included."""
+        return self.count // self.num_groups
 
     def prior(self, variance: ModeVariance) -> jax.Array:
         """Prior covariance [centre, centre], computed once for each smoothness."""
@@ -50,10 +64,21 @@ class Centres:
             self._prior[id(variance)] = variance, covariance(variance, self.snapped, self.features)
         return self._prior[id(variance)][1]
 
+    def lower_inverse(self, variance: ModeVariance, level: float) -> np.ndarray:
+        """Lower triangle of the inverse of prior plus noise, no direction doubted; computed once for each pair."""
+        key = id(variance), level
+        if key not in self._inverse:
+            self._inverse[key] = lower_inverse(np.asarray(self.prior(variance)), self.noise(level))
+        return self._inverse[key]
+
+    def noise(self, level: float) -> np.ndarray:
+        """Noise variance [centre] where one sample has `level`: less for repeats; padding has no effect."""
+        return np.where(self.number > 0, level / np.maximum(self.number, 1), PADDING_NOISE)
+
     def take(self, row: np.ndarray) -> "Centres":
         """Return the centres for some of the rows: those left without a sample stay, and have no effect."""
         place = np.searchsorted(self.row, row)
-        return dataclasses.replace(self, row=row, index=self.index[place])
+        return dataclasses.replace(self, row=row, index=self.index[place], _inverse={})
 
     @property
     def number(self) -> np.ndarray:
@@ -67,10 +92,12 @@ class Centres:
         return (sums @ values) / np.maximum(self.number, 1)[:, None]
 
 
-def place_centres(samples: RawSamples) -> Centres:
+def place_centres(samples: RawSamples, reciprocal: bool = False) -> Centres:
     """Merge, group and pad the directions of a measurement; its values have no influence."""
     theta_i, theta_o, phi_o = samples.theta_i, samples.theta_o, samples.phi_o
     measured = np.array([theta_i.max(), theta_o.max()])
+    if reciprocal:
+        measured[:] = measured.max()
     limit = np.minimum(measured + EXTRAPOLATION, STEEPEST)
     azimuth = fold_azimuth(phi_o)
     half = np.asarray(guided_coordinates(*map(jnp.asarray, (theta_i, theta_o, azimuth, limit))).half)
@@ -94,6 +121,7 @@ def place_centres(samples: RawSamples) -> Centres:
         angles=angles,
         theta_limit=limit,
         features=group_features(grouped),
+        reciprocal=reciprocal,
     )
 
 

@@ -5,6 +5,7 @@ stretches the neighbourhood of the mirror direction, or the folded azimuth. Near
 pole the azimuth is compressed to a constant, so that the field is exactly isotropic there.
 """
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ from sbrdf_jax.records import pytree
 COS_FLOOR = float(np.cos(np.deg2rad(85.0)))  # every cosine that divides or weighs is at least this
 EXTRAPOLATION = np.deg2rad(10.0)  # beyond the measured range the field goes on so far, then stays
 POLE_BLEND = 0.005  # sin(theta_i) sin(theta_o) at which the azimuth has half of its effect
+COS_POWER = 0.25  # of both cosines, in the floor
 LARGEST_Z = 80.0  # an exponential of more would be of no use to anyone
 
 
@@ -71,34 +73,44 @@ def guided_coordinates(
     )
 
 
+def exchanged(at: Coordinates) -> Coordinates:
+    """Return the coordinates of the same light the other way: half angle and azimuth do not change."""
+    return dataclasses.replace(at, theta_i=at.theta_o, theta_o=at.theta_i)
+
+
 def floored_cos(theta: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Cosine of a polar angle [rad], at least cos 85 degrees."""
     return jnp.maximum(jnp.cos(theta), COS_FLOOR)
 
 
 @jax.jit
+def log_scale(at: Coordinates, floor: Float[Array, ""]) -> Float[Array, "*shape"]:
+    """Factor (cos theta_i cos theta_o)^1/4 / floor [sr] on a value in the generalised logarithm.
+
+    What an instrument cannot see grows towards grazing. The factor is the same for both
+    directions of light, so that a field that is reciprocal in z is so in its values.
+    """
+    return (floored_cos(at.theta_i) * floored_cos(at.theta_o)) ** COS_POWER / floor
+
+
+@jax.jit
 def to_log(
-    value: Float[Array, "*shape wavelength"], theta_i: Float[Array, "*shape"], floor: Float[Array, ""]
+    value: Float[Array, "*shape wavelength"], scale: Float[Array, "*shape"]
 ) -> Float[Array, "*shape wavelength"]:
-    """Generalised logarithm z = log(1 + value sqrt(cos theta_i) / floor): relative above the floor, absolute below.
+    """Generalised logarithm z = log(1 + value scale): relative above the floor, absolute below.
 
     Values below 0 are counted as 0: they are at or below the noise.
     """
-    scale = jnp.sqrt(floored_cos(theta_i))[..., None] / floor
-    return jnp.log1p(jnp.maximum(value, 0.0) * scale)
+    return jnp.log1p(jnp.maximum(value, 0.0) * scale[..., None])
 
 
 @jax.jit
-def from_log(
-    z: Float[Array, "*shape wavelength"], theta_i: Float[Array, "*shape"], floor: Float[Array, ""]
-) -> Float[Array, "*shape wavelength"]:
+def from_log(z: Float[Array, "*shape wavelength"], scale: Float[Array, "*shape"]) -> Float[Array, "*shape wavelength"]:
     """Inverse of `to_log`; never negative, because a z below 0 counts as 0."""
-    return floor * jnp.expm1(jnp.clip(z, 0.0, LARGEST_Z)) / jnp.sqrt(floored_cos(theta_i))[..., None]
+    return jnp.expm1(jnp.clip(z, 0.0, LARGEST_Z)) / scale[..., None]
 
 
 @jax.jit
-def slope(
-    z: Float[Array, "*shape wavelength"], theta_i: Float[Array, "*shape"], floor: Float[Array, ""]
-) -> Float[Array, "*shape wavelength"]:
+def slope(z: Float[Array, "*shape wavelength"], scale: Float[Array, "*shape"]) -> Float[Array, "*shape wavelength"]:
     """Derivative of `from_log` by z [1/sr]; where z is below 0, that at 0."""
-    return floor * jnp.exp(jnp.clip(z, 0.0, LARGEST_Z)) / jnp.sqrt(floored_cos(theta_i))[..., None]
+    return jnp.exp(jnp.clip(z, 0.0, LARGEST_Z)) / scale[..., None]

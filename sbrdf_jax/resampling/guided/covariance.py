@@ -3,7 +3,8 @@
 With samples A x, energy x' E x and noise N, the normal equations (A' N^-1 A + E) x = A' N^-1 r
 have the dual (A E^-1 A' + N) a = r, x = E^-1 A' a: as large as the samples, not the nodes.
 Samples of one incident angle share the modes of theta_i, so A E^-1 A' needs the modes of
-the two other axes only, once per pair of a direction and an incident angle.
+the two other axes only, once per pair of a direction and an incident angle. Nodes tied by
+reciprocity are the mean of both ways: A becomes (A + A exchanged) / 2.
 """
 
 import dataclasses
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sbrdf_jax.records import pytree
-from sbrdf_jax.resampling.guided.coordinates import Coordinates, guided_coordinates
+from sbrdf_jax.resampling.guided.coordinates import Coordinates, exchanged, guided_coordinates
 from sbrdf_jax.resampling.guided.nodes import GRIDS, Features, ModeVariance, features_of, synthesise
 
 DIRECTIONS_AT_A_TIME = 256
@@ -67,7 +68,14 @@ def _covariance(variance: ModeVariance, left: Features, right: GroupedFeatures):
 @jax.jit
 def covariance(variance: ModeVariance, at: Coordinates, centres: GroupedFeatures) -> Float[Array, "direction centre"]:
     """Prior covariance A E^-1 A' of the residual between directions and grouped centres (flattened)."""
-    return in_chunks(lambda chunk: _covariance(variance, features_of(chunk), centres), at, DIRECTIONS_AT_A_TIME)
+
+    def of_chunk(chunk):
+        forth = _covariance(variance, features_of(chunk), centres)
+        if not variance.reciprocal:
+            return forth
+        return (forth + _covariance(variance, features_of(exchanged(chunk)), centres)) / 2
+
+    return in_chunks(of_chunk, at, DIRECTIONS_AT_A_TIME)
 
 
 def in_chunks(function: Callable[[Any], Array], directions: Any, size: int) -> Array:
@@ -83,11 +91,17 @@ def in_chunks(function: Callable[[Any], Array], directions: Any, size: int) -> A
 def prior_variance(variance: ModeVariance, at: Coordinates) -> Float[Array, " direction"]:
     """Prior variance of the residual in each direction: the diagonal of `covariance` with itself."""
     features = features_of(at)
-    total = jnp.zeros_like(at.theta_i)
-    for name in GRIDS:
-        weight = features.theta_i**2 @ _by_theta_i(getattr(variance, name))
-        total = total + jnp.sum(weight * getattr(features, name) ** 2, axis=1)
-    return total
+
+    def with_features(others: Features):
+        total = jnp.zeros_like(at.theta_i)
+        for name in GRIDS:
+            weight = (features.theta_i * others.theta_i) @ _by_theta_i(getattr(variance, name))
+            total = total + jnp.sum(weight * getattr(features, name) * getattr(others, name), axis=1)
+        return total
+
+    if not variance.reciprocal:
+        return with_features(features)
+    return (with_features(features) + with_features(features_of(exchanged(at)))) / 2
 
 
 def mode_sums(
@@ -110,6 +124,8 @@ def node_values(
 ) -> tuple[Float[Array, "half theta_i theta_o wavelength"], Float[Array, "azimuth theta_i theta_o wavelength"]]:
     """Return the nodes x = E^-1 A' a of both grids, from dual coefficients a."""
     sums = mode_sums(centres, dual)
+    if variance.reciprocal:
+        sums = {name: (modes + jnp.swapaxes(modes, 1, 2)) / 2 for name, modes in sums.items()}
     half, azimuth = (
         synthesise(sums[name] * jnp.asarray(getattr(variance, name))[..., None], axes) for name, axes in GRIDS.items()
     )

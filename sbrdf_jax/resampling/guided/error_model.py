@@ -12,6 +12,7 @@ from sbrdf_jax.records import pytree
 SMALLEST_FLOOR = 5e-4  # 1/sr, an albedo of 0.16 %: below it, what is measured is mostly clipped noise
 FLOOR_SHARE = (0.03, 0.3)  # bounds of the floor, as shares of the measurement's typical value
 DARK_SHARE = 0.2
+MOST_SAMPLES = 8192  # more say no more about the errors of all
 TO_SIGMA = 1.4826  # median absolute deviation to standard deviation
 NUM_NEIGHBOURS = 25
 NEIGHBOUR_SCALE = (0.5, 0.25, 0.4)  # of half, theta_i, theta_o, where residuals are compared
@@ -35,14 +36,22 @@ def estimate_floor(theta_i: np.ndarray, theta_o: np.ndarray, azimuth: np.ndarray
         Floor of the generalised logarithm [1/sr].
     """
     place = np.stack([20 * theta_i, np.sin(theta_o) * np.cos(azimuth), np.sin(theta_o) * np.sin(azimuth)], axis=1)
-    neighbour = np.asarray(scipy.spatial.KDTree(place).query(place, k=2)[1])
-    other = value[neighbour[:, 1]]
-    level, difference = (value + other) / 2, np.abs(value - other)
+    some = spread_rows(len(place))
+    neighbour = np.asarray(scipy.spatial.KDTree(place).query(place[some], k=2)[1])
+    one, other = value[neighbour[:, 0]], value[neighbour[:, 1]]
+    level, difference = (one + other) / 2, np.abs(one - other)
     positive = level > 0
     typical = float(np.median(level[positive]))
     dark = positive & (level <= np.quantile(level[positive], DARK_SHARE))
     noise = TO_SIGMA * float(np.median(difference[dark])) / np.sqrt(2)
     return float(np.clip(max(noise, SMALLEST_FLOOR), FLOOR_SHARE[0] * typical, FLOOR_SHARE[1] * typical))
+
+
+def spread_rows(count: int) -> np.ndarray:
+    """Rows that stand for all: all of a few, else some drawn at random, always the same."""
+    if count <= MOST_SAMPLES:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(0).choice(count, MOST_SAMPLES, replace=False))
 
 
 def noise_factors(half: np.ndarray, theta_i: np.ndarray, theta_o: np.ndarray, residual: np.ndarray) -> np.ndarray:

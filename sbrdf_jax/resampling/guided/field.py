@@ -5,10 +5,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sbrdf_jax.records import pytree
-from sbrdf_jax.resampling.guided.coordinates import Coordinates, from_log, guided_coordinates, slope
+from sbrdf_jax.resampling.guided.coordinates import Coordinates, from_log, guided_coordinates, log_scale, slope
 from sbrdf_jax.resampling.guided.covariance import (
     covariance,
     flatten,
@@ -18,6 +19,7 @@ from sbrdf_jax.resampling.guided.covariance import (
     prior_variance,
 )
 from sbrdf_jax.resampling.guided.error_model import ResidualScale, residual_scale
+from sbrdf_jax.resampling.guided.inverse import whitener
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
 from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, interpolate
 
@@ -46,7 +48,8 @@ class GuidedField:
     scale: ResidualScale
     multiplier: Any  # [group, member, wavelength] unknowns of the bounded problem
     model_residual: Any  # [wavelength] relative gradient norm of the lobe model's fit
-    curve: Any  # [3, trial] prior (place in PRIORS), noise, mean root of the leave-one-out residuals, squared
+    reciprocity_cost: Any  # left-out errors with nodes tied by reciprocity over those without; 1 where not tied
+    curve: Any  # [2, trial] noise and left-out error of z
 
 
 @jax.jit
@@ -58,7 +61,7 @@ def evaluate_direction(
     Never negative, finite everywhere, and independent of phi_o where theta_i or theta_o is 0.
     """
     at = guided_coordinates(theta_i, theta_o, phi_o, field.theta_limit)
-    return from_log(_log_value(field, at), at.theta_i, field.floor)
+    return from_log(_log_value(field, at), log_scale(at, field.floor))
 
 
 def _log_value(field: GuidedField, at: Coordinates):
@@ -75,9 +78,17 @@ def each_direction(function: Callable[[Any], Array], directions: Any) -> Array:
     return jax.vmap(function)(directions)
 
 
+def field_whitener(field: GuidedField) -> np.ndarray:
+    """Inverse Cholesky factor [centre, centre] of prior covariance plus noise, which standard errors need."""
+    centres = group_coordinates(jnp.asarray(field.centre), jnp.asarray(field.theta_limit))
+    prior = covariance(field.variance, flatten(centres), group_features(centres))
+    return whitener(np.asarray(prior), np.asarray(field.noise).reshape(-1))
+
+
 @jax.jit
 def evaluate_with_error(
     field: GuidedField,
+    whiten: Float[Array, "centre centre"],
     theta_i: Float[Array, " direction"],
     theta_o: Float[Array, " direction"],
     phi_o: Float[Array, " direction"],
@@ -92,6 +103,7 @@ def evaluate_with_error(
 
     Args:
         field: The fitted field.
+        whiten: Inverse Cholesky factor of prior plus noise, from `field_whitener`.
         theta_i: Polar angle of incidence [rad].
         theta_o: Polar angle of exitance [rad].
         phi_o: Azimuth of exitance [rad]; the mirror direction is at pi.
@@ -99,18 +111,17 @@ def evaluate_with_error(
     Returns:
         BRDF, standard error and noise [1/sr], at the measured wavelengths.
     """
-    centres = group_coordinates(field.centre, field.theta_limit)
-    features = group_features(centres)
-    prior = covariance(field.variance, flatten(centres), features)
-    factor = jnp.linalg.cholesky(prior + jnp.diag(field.noise.reshape(-1)))
+    features = group_features(group_coordinates(field.centre, field.theta_limit))
 
     def of_chunk(angles):
         at = guided_coordinates(*angles, field.theta_limit)
         z = each_direction(lambda place: _log_value(field, place), at)
-        root = jax.scipy.linalg.solve_triangular(factor, covariance(field.variance, at, features).T, lower=True)
-        variance = jnp.maximum(prior_variance(field.variance, at) - jnp.sum(root**2, axis=0), 0.0)
-        unit = residual_scale(field.scale, at.theta_i, at.half, z) * slope(z, at.theta_i, field.floor)
-        value = from_log(z, at.theta_i, field.floor)
+        cross = covariance(field.variance, at, features)
+        explained = jnp.sum((cross @ whiten.T) ** 2, axis=1)
+        variance = jnp.maximum(prior_variance(field.variance, at) - explained, 0.0)
+        scale = log_scale(at, field.floor)
+        unit = residual_scale(field.scale, at.theta_i, at.half, z) * slope(z, scale)
+        value = from_log(z, scale)
         return jnp.stack([value, unit * jnp.sqrt(variance)[:, None], unit * jnp.sqrt(field.noise_level)], axis=1)
 
     found = in_chunks(of_chunk, (theta_i, theta_o, phi_o), DIRECTIONS_AT_A_TIME)

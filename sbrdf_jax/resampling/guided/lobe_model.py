@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sbrdf_jax.records import pytree
-from sbrdf_jax.resampling.guided.coordinates import Coordinates, floored_cos
+from sbrdf_jax.resampling.guided.coordinates import Coordinates, floored_cos, log_scale, to_log
 
 MIRROR_POWER = 2  # of tan^2 theta_h: an aperture's image is flatter than a Gaussian, and steeper at its edge
 NUM_TERMS = 4  # diffuse, mirror, narrow lobe, broad lobe
@@ -83,7 +83,7 @@ def lobe_terms(shape: Float[Array, " 9"], at: Coordinates) -> Float[Array, "*sha
 def lobe_log_value(model: LobeModel, at: Coordinates, floor: Float[Array, ""]) -> Float[Array, "*shape wavelength"]:
     """Generalised logarithm z of the model."""
     value = lobe_terms(model.shape, at) @ jnp.exp(model.log_amplitude)
-    return jnp.log1p(value * jnp.sqrt(floored_cos(at.theta_i))[..., None] / floor)
+    return to_log(value, log_scale(at, floor))
 
 
 class _State(NamedTuple):
@@ -112,7 +112,7 @@ def _minimise(model, at, z, weight, floor, *, fit_shape: bool, max_steps: int) -
     The 4 x 4 block of each wavelength is eliminated; the shared shape solves a 9 x 9 Schur complement.
     """
     num = z.shape[1]
-    scale = (jnp.sqrt(floored_cos(at.theta_i)) / floor)[:, None]
+    scale = log_scale(at, floor)[:, None]
     prior_weight = jnp.asarray(PRIOR_WEIGHT * num / PRIOR_SPREAD**2) * weight.sum() * float(fit_shape)
 
     def step(state: _State) -> _State:

@@ -61,16 +61,17 @@ class Term(NamedTuple):
     lengths: tuple[float, float, float]  # in the grid's coordinates
 
 
-@pytree()
+@pytree(static=("reciprocal",))
 class ModeVariance:
     """Prior variance of each cosine mode; E^-1 of either grid is modes x variance x modes'."""
 
     half: Any  # [half, theta_i, theta_o]
     azimuth: Any  # [azimuth, theta_i, theta_o]
+    reciprocal: bool = False  # nodes of exchanged theta_i and theta_o are tied
 
 
 @functools.cache
-def mode_variance(terms: tuple[Term, ...], constant: float) -> ModeVariance:
+def mode_variance(terms: tuple[Term, ...], constant: float, reciprocal: bool = False) -> ModeVariance:
     """Return the variances of a prior's modes.
 
     The spectrum of a Matern term of order v in three dimensions is proportional to
@@ -79,6 +80,7 @@ def mode_variance(terms: tuple[Term, ...], constant: float) -> ModeVariance:
     Args:
         terms: The prior's terms, which add up.
         constant: Variance of a constant added to all.
+        reciprocal: Tie nodes by Helmholtz reciprocity.
     """
     total = {name: np.zeros([axis.count for axis in axes]) for name, axes in GRIDS.items()}
     for term in terms:
@@ -88,7 +90,9 @@ def mode_variance(terms: tuple[Term, ...], constant: float) -> ModeVariance:
         level = 8 * np.pi**1.5 * math.gamma(order + 1.5) / math.gamma(order) * (2 * order) ** order
         total[term.grid] += term.variance * level * np.prod(term.lengths) * (2 * order + square) ** -(order + 1.5)
     total["half"][0, 0, 0] += constant * np.prod([axis.stop - axis.start for axis in GRIDS["half"]])
-    return ModeVariance(half=total["half"], azimuth=total["azimuth"])
+    if reciprocal:
+        total = {name: (modes + np.swapaxes(modes, 1, 2)) / 2 for name, modes in total.items()}
+    return ModeVariance(half=total["half"], azimuth=total["azimuth"], reciprocal=reciprocal)
 
 
 def cubic_weights(x: Float[Array, "*shape"], axis: Axis) -> tuple[Int[Array, "*shape"], Float[Array, "*shape 4"]]:

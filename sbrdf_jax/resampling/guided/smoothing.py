@@ -1,119 +1,94 @@
-"""How smooth: chosen by the data, by closed-form leave-one-out."""
+"""How smooth: chosen by the data, by leave-one-out and leave-one-incident-angle-out, both in closed form.
+
+A field is read between measured directions of a measured incident angle and between
+incident angles: what is best for the one alone can be poor for the other.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg.blas
-import scipy.linalg.lapack
 
 from sbrdf_jax.resampling.guided.centres import Centres
+from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out
 from sbrdf_jax.resampling.guided.nodes import ModeVariance, Term, mode_variance
 
 CONSTANT = 1e-2  # variance of a constant, relative to the half-angle term's
-_WIDE = Term("half", 1.5, 1.0, (3.0, 1.0, 1.0))
-_LONG = Term("azimuth", 0.5, 0.3, (10.0, 3.3, 3.3))
-_FINE = Term("azimuth", 0.5, 0.06, (3.0, 0.4, 1.0))
-PRIORS = {"fine": (_WIDE, _LONG, _FINE), "smooth": (_WIDE, _LONG)}  # candidates
+PRIOR = (
+    Term("half", 1.5, 1.0, (3.0, 1.5, 1.0)),
+    Term("azimuth", 0.5, 0.3, (10.0, 3.3, 3.3)),
+    Term("half", 0.5, 0.04, (3.0, 0.5, 1.0)),
+    Term("azimuth", 0.5, 0.02, (3.0, 0.8, 1.0)),
+)
 NOISE_LADDER = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1, 3e-1)  # noise variance relative to the half-angle term's
 FIRST_NOISE = 3e-3
-PADDING_NOISE = 1e12
 
 
 class Choice(NamedTuple):
-    """A prior and a noise level, and the curve that led to them: (prior, noise, score) each."""
+    """A noise level, and the curve that led to it: (noise, left-out error) each."""
 
-    name: str
     variance: ModeVariance
     noise: float
-    curve: tuple[tuple[str, float, float], ...]
+    curve: tuple[tuple[float, float], ...]
     left_out: np.ndarray  # [centre, wavelength] leave-one-out residuals
+    reciprocity_cost: float  # left-out error with nodes tied by reciprocity over that without; 1 where not tied
 
 
-def lower_inverse(prior: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Lower triangle of the inverse of prior covariance [centre, centre] plus noise [centre]; nan where it has none."""
-    total = np.array(prior, order="F")
-    total[np.diag_indices_from(total)] += noise
-    factor, failed = scipy.linalg.lapack.dpotrf(total, lower=1, overwrite_a=1)
-    if failed:
-        return np.full_like(total, np.nan)
-    return scipy.linalg.lapack.dpotri(factor, lower=1, overwrite_c=1)[0]
+def mean_root(residual: np.ndarray) -> float:
+    """Mean root of absolute residuals, squared: outliers count little."""
+    return float(np.mean(np.sqrt(np.abs(residual))) ** 2)
 
 
-def invert(prior: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Inverse of prior covariance plus noise."""
-    lower = np.tril(lower_inverse(prior, noise))
-    return lower + np.tril(lower, -1).T
-
-
-def leave_one_out(prior: np.ndarray, noise: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Exact leave-one-out residuals [centre, wavelength]: with C the inverse of prior plus noise, (C r)_i / C_ii."""
-    lower = lower_inverse(prior, noise)
-    return scipy.linalg.blas.dsymm(1.0, lower, residual, lower=1) / np.diag(lower)[:, None]
-
-
-def leave_group_out(inverse: np.ndarray, dual: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Exact residuals of leaving whole groups out, and their variances: C_gg^-1 (C r)_g, diagonal of C_gg^-1.
-
-    Args:
-        inverse: C, the inverse of prior plus noise.
-        dual: C r [centre, wavelength].
-        group: Group number per centre; negative ones are left in always, and get zeros.
-    """
-    out, variance = np.zeros_like(dual), np.zeros(len(dual))
-    for number in np.unique(group[group >= 0]):
-        rows = np.flatnonzero(group == number)
-        block = np.linalg.inv(inverse[np.ix_(rows, rows)])
-        out[rows], variance[rows] = block @ dual[rows], np.diag(block)
-    return out, variance
-
-
-def noise_of(level: float, number: np.ndarray) -> np.ndarray:
-    """Noise variance [centre] of centres that stand for `number` samples each; without effect where there is none."""
-    return np.where(number > 0, level / np.maximum(number, 1), PADDING_NOISE)
-
-
-def choose_smoothing(centres: Centres, residual: np.ndarray, number: np.ndarray, noise: float | None) -> Choice:
-    """Choose the prior and the noise by the mean root of the leave-one-out residuals, squared: outliers count little.
-
-    The noise climbs a ladder with the first prior; the others are tried at its best step.
+def left_out_error(
+    centres: Centres, residual: np.ndarray, variance: ModeVariance, noise: float
+) -> tuple[float, np.ndarray]:
+    """Geometric mean of the errors of left-out directions and of left-out incident angles, in z.
 
     Args:
         centres: Where the samples are.
         residual: z minus the lobe model's [centre, wavelength].
-        number: Samples that each centre stands for.
+        variance: The prior.
+        noise: Noise variance of one sample.
+
+    Returns:
+        The error, inf where there is none, and the leave-one-out residuals [centre, wavelength].
+    """
+    seen = centres.number > 0
+    lower = centres.lower_inverse(variance, noise)
+    out, dual = leave_one_out(lower, residual)
+    error = mean_root(out[seen])
+    if centres.num_groups > 1:
+        group = np.where(seen, np.arange(centres.count) // centres.num_members, -1)
+        error = float(np.sqrt(error * mean_root(leave_group_out(lower, dual, group)[0][seen])))
+    return error if np.isfinite(error) else np.inf, out
+
+
+def choose_smoothing(centres: Centres, residual: np.ndarray, noise: float | None) -> Choice:
+    """Choose how smooth the residual is: the noise climbs a ladder while `left_out_error` falls.
+
+    Args:
+        centres: Where the samples are.
+        residual: z minus the lobe model's [centre, wavelength].
         noise: Fixed relative noise variance; None: chosen.
     """
-    curve: list[tuple[str, float, float]] = []
-    left_out: dict[tuple[str, float], np.ndarray] = {}
-    used = number > 0
+    variance = mode_variance(PRIOR, CONSTANT, centres.reciprocal)
+    tried: dict[float, tuple[float, np.ndarray]] = {}
 
-    def score(name: str, level: float) -> float:
-        prior = np.asarray(centres.prior(mode_variance(PRIORS[name], CONSTANT)))
-        out = leave_one_out(prior, noise_of(level, number), residual)
-        left_out[name, level] = out
-        value = float(np.mean(np.sqrt(np.abs(out[used]))) ** 2)
-        curve.append((name, level, value if np.isfinite(value) else np.inf))
-        return curve[-1][2]
+    def error(level: float) -> float:
+        if level not in tried:
+            tried[level] = left_out_error(centres, residual, variance, level)
+        return tried[level][0]
 
-    first, *others = PRIORS
     if noise is None:
-        step = NOISE_LADDER.index(FIRST_NOISE)
-        best = score(first, NOISE_LADDER[step])
+        ladder = NOISE_LADDER
+        step = ladder.index(FIRST_NOISE)
         for direction in (1, -1):
-            start = step
-            while 0 <= step + direction < len(NOISE_LADDER):
-                value = score(first, NOISE_LADDER[step + direction])
-                if not value < best:
-                    break
-                best, step = value, step + direction
-            if step != start:
-                break
-        noise = NOISE_LADDER[step]
-    else:
-        best = score(first, noise)
-    name = first
-    for other in others:
-        value = score(other, noise)
-        if value < best:
-            name, best = other, value
-    return Choice(name, mode_variance(PRIORS[name], CONSTANT), noise, tuple(curve), left_out[name, noise])
+            while 0 <= step + direction < len(ladder) and error(ladder[step + direction]) < error(ladder[step]):
+                step += direction
+        noise = ladder[step]
+    cost = 1.0
+    if centres.reciprocal:
+        free = mode_variance(PRIOR, CONSTANT)
+        cost = error(noise) / left_out_error(centres, residual, free, noise)[0]
+    error(noise)
+    curve = tuple((level, found[0]) for level, found in sorted(tried.items()))
+    return Choice(variance, noise, curve, tried[noise][1], cost)

@@ -1,0 +1,68 @@
+"""The inverse of prior covariance plus noise, on the host, and the closed forms that it gives.
+
+One BLAS thread: two that wait for a core that another process holds take ten times longer
+than one that works, and these matrices are too small for a second thread to matter.
+"""
+
+import numpy as np
+import scipy.linalg.blas
+import scipy.linalg.lapack
+from threadpoolctl import threadpool_limits
+
+
+def lower_inverse(prior: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Lower triangle of the inverse of prior covariance [centre, centre] plus noise [centre]; nan where it has none."""
+    return lower_product(whitener(prior, noise))
+
+
+def whitener(prior: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Inverse W of the lower Cholesky factor of prior plus noise: the inverse is W'W; nan where there is none."""
+    total = np.array(prior, order="F")
+    total[np.diag_indices_from(total)] += noise
+    with threadpool_limits(1, user_api="blas"):
+        factor, failed = scipy.linalg.lapack.dpotrf(total, lower=1, overwrite_a=1)  # zeros above the diagonal
+        if failed:
+            return np.full_like(total, np.nan)
+        return scipy.linalg.lapack.dtrtri(factor, lower=1, overwrite_c=1)[0]
+
+
+def lower_product(whiten: np.ndarray) -> np.ndarray:
+    """Lower triangle of W'W; what is above is not to be read."""
+    with threadpool_limits(1, user_api="blas"):
+        return scipy.linalg.lapack.dlauum(whiten, lower=1)[0]
+
+
+def mirror_lower(lower: np.ndarray) -> np.ndarray:
+    """Symmetric matrix from its lower triangle; what is above is not read."""
+    lower = np.tril(lower)
+    return lower + np.tril(lower, -1).T
+
+
+def leave_one_out(lower: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Exact leave-one-out residuals [centre, wavelength], (C r)_i / C_ii, and C r.
+
+    Args:
+        lower: Lower triangle of C, the inverse of prior plus noise.
+        residual: r [centre, wavelength].
+    """
+    with threadpool_limits(1, user_api="blas"):
+        dual = scipy.linalg.blas.dsymm(1.0, lower, residual, lower=1)
+    return dual / np.diag(lower)[:, None], dual
+
+
+def leave_group_out(lower: np.ndarray, dual: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Exact residuals of leaving whole groups out, and their variances: C_gg^-1 (C r)_g, diagonal of C_gg^-1.
+
+    Args:
+        lower: Lower triangle of C, the inverse of prior plus noise.
+        dual: C r [centre, wavelength].
+        group: Group number per centre; negative ones are left in always, and get zeros.
+    """
+    out, variance = np.zeros_like(dual), np.zeros(len(dual))
+    for number in np.unique(group[group >= 0]):
+        rows = np.flatnonzero(group == number)
+        block = lower_inverse(mirror_lower(lower[np.ix_(rows, rows)]), np.zeros(len(rows)))
+        with threadpool_limits(1, user_api="blas"):
+            out[rows] = scipy.linalg.blas.dsymm(1.0, block, dual[rows], lower=1)
+        variance[rows] = np.diag(block)
+    return out, variance
