@@ -52,7 +52,7 @@ def check_options(tree: Tree, *, complete: bool = True) -> RunOptions | None:
     try:
         return _validated(RunOptions, tree)
     except pydantic.ValidationError as error:
-        wrong = _wrong_items(tree, error)
+        wrong = _wrong_items(tree, error, depth=2)
     if not complete:
         wrong = [item for item in wrong if not (item[1] and item[2] in _NO_DEFAULT)]
     if not wrong:
@@ -74,7 +74,7 @@ def check_record(tree: Tree, record: type[Record]) -> Record:
     try:
         return _validated(record, tree)
     except pydantic.ValidationError as error:
-        raise _error_of(tree, record, _wrong_items(tree, error)[0]) from None
+        raise _error_of(tree, record, _wrong_items(tree, error, depth=1)[0]) from None
 
 
 @functools.cache
@@ -87,11 +87,11 @@ def _validated(record: type, tree: Tree) -> Any:
     return _adapter(record).validate_json(pydantic_core.to_json(tree.data, inf_nan_mode="constants"))
 
 
-def _wrong_items(tree: Tree, error: pydantic.ValidationError) -> list[WrongItem]:
-    """What pydantic found, the item that says most first: of a union every member complains."""
+def _wrong_items(tree: Tree, error: pydantic.ValidationError, depth: int) -> list[WrongItem]:
+    """What pydantic found, the item that says most first: of a union, `depth` keys down, every member complains."""
     wrong = [(_path_in(tree.data, item["loc"]), item["type"] == "missing", item["loc"]) for item in error.errors()]
     order = {path: number for number, path in enumerate(tree.values)}
-    return sorted(wrong, key=lambda item: (order[item[0][:2]], -len(item[2]), order[item[0]]))
+    return sorted(wrong, key=lambda item: (order[item[0][:depth]], -len(item[2]), order[item[0]]))
 
 
 def _error_of(tree: Tree, record: type, item: WrongItem) -> UserError:

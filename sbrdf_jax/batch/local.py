@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from multiprocessing import connection
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from sbrdf_jax.batch.attempt import give_up
 from sbrdf_jax.batch.library import Material
@@ -27,6 +27,7 @@ HDF5_MAGIC = b"\x89HDF"
 Group = deque[Material]
 
 
+@runtime_checkable
 class Watcher(Protocol):
     """What an executor reports to."""
 

@@ -7,7 +7,7 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -16,13 +16,12 @@ from sbrdf_jax.config import BUILTIN, config_sha256, parse_config
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.hdf5 import attribute, one_line_errors
 from sbrdf_jax.options import OutputOptions, RunOptions
-from sbrdf_jax.records import Status
-from sbrdf_jax.store import open_result
+from sbrdf_jax.schema import open_result
+from sbrdf_jax.status import Status
 
 STACKED = ("grid", "spectral", "compact", "metrics")  # groups whose datasets the index stacks over materials
 _PATH_LINE = re.compile(r"^  path: .*$", re.MULTILINE)  # of input and output, which `config_key` leaves out
 _FAILED = (int(Status.MAX_STEPS), int(Status.NONFINITE))
-Value = TypeVar("Value")
 
 
 class Checked(NamedTuple):
@@ -38,20 +37,20 @@ class Checked(NamedTuple):
     layout: str  # JSON: shape and type of each dataset that the index stacks
 
 
-class Seen(NamedTuple, Generic[Value]):
+class Seen(NamedTuple):
     """What was found in a file of this size and time."""
 
     size: int
     time_ns: int
-    value: Value
+    value: Any
 
 
 @dataclasses.dataclass
 class Memory:
     """What was found in files, by their paths."""
 
-    results: dict[str, Seen[Checked]] = dataclasses.field(default_factory=dict)
-    sources: dict[str, Seen[str]] = dataclasses.field(default_factory=dict)
+    results: dict[str, Seen] = dataclasses.field(default_factory=dict)  # of Checked
+    sources: dict[str, Seen] = dataclasses.field(default_factory=dict)  # of SHA-256
 
     def source(self, path: str) -> str:
         """SHA-256 of a measurement.

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sbrdf_jax.batch.library import Material
-from sbrdf_jax.batch.memory import Checked, Memory, Seen, config_key
+from sbrdf_jax.batch.memory import Memory, Seen, config_key
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.files import whole_file
 
@@ -41,8 +41,8 @@ class Outcome:
     cpu_seconds: float = 0.0
     worst_error: float = math.nan  # relative, of the compact form, over incident angles
     computed: bool = False
-    result: Seen[Checked] | None = None  # what its process has read, so that others need not
-    source: Seen[str] | None = None
+    result: Seen | None = None  # what its process has read, so that others need not
+    source: Seen | None = None
 
 
 class Failure(NamedTuple):
@@ -122,5 +122,5 @@ def _read_failure(material: Material) -> Failure | None:
     try:
         note = json.loads(_failure(material).read_text(encoding="utf-8"))
         return Failure((note["config"], note["source"]), str(note["reason"]))
-    except (FileNotFoundError, ValueError, KeyError, TypeError):
+    except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, TypeError):
         return None
