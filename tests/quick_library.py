@@ -13,7 +13,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from sbrdf_jax.batch import executors
+from sbrdf_jax.batch import executors, slurm
 from sbrdf_jax.batch.library import Material
 from sbrdf_jax.cli import main_exit
 from sbrdf_jax.config import resolved_yaml
@@ -77,5 +77,6 @@ def _sha256(path: Path) -> str:
 
 if __name__ == "__main__":
     executors.compute_material = compute
+    slurm.PROGRAM = (sys.executable, __file__)
     sys.argv[0] = "sbrdf"
     main_exit("batch")

@@ -12,7 +12,7 @@ from sbrdf_jax.runtime import usable_cores, worker_environment
 
 
 def execute(options: ExecutorOptions, materials: Sequence[Material], watcher: Watcher, retry_failed: bool) -> None:
-    """Bring every material to its result or its failure, as the options say.
+    """Bring every material to its result or its failure, by processes of this machine or by dask.
 
     Raises:
         UserError: The executor is not installed or does not answer.
@@ -21,8 +21,14 @@ def execute(options: ExecutorOptions, materials: Sequence[Material], watcher: Wa
         return
     work = Work(compute_material, retry_failed)
     workers, threads = divide_cores(options, len(materials))
-    os.environ.update(worker_environment(threads, options.compile_cache))  # which workers inherit
-    run_local(materials, work, workers, options.tries, watcher)
+    environment = worker_environment(threads, options.compile_cache)
+    if options.kind == "dask":
+        from sbrdf_jax.batch.dask_cluster import run_dask
+
+        run_dask(materials, work, workers, environment, options, watcher)
+    else:
+        os.environ.update(environment)  # which workers inherit
+        run_local(materials, work, workers, options.tries, watcher)
 
 
 def divide_cores(options: ExecutorOptions, materials: int) -> tuple[int, int]:

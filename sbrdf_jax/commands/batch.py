@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
         if library.folder.is_dir() and not args.shard:
             write_index(library.folder, materials, outcomes, memory)
         return exit_code(outcomes)
-    return _run(args, library, materials, outcomes, memory)
+    return _run(args, overrides, library, materials, outcomes, memory)
 
 
 def exit_code(outcomes: Sequence["Outcome"]) -> int:
@@ -110,6 +110,7 @@ def open_folder(library: "Library", shard: tuple[int, int] | None) -> "Progress"
 
 def _run(
     args: argparse.Namespace,
+    overrides: Sequence[str],
     library: "Library",
     materials: Sequence["Material"],
     outcomes: Sequence["Outcome"],
@@ -117,12 +118,16 @@ def _run(
 ) -> int:
     from sbrdf_jax.batch.executors import execute
     from sbrdf_jax.batch.index import write_index
+    from sbrdf_jax.batch.slurm import submit
     from sbrdf_jax.batch.watch import Watch, count_states, needs_work, table
     from sbrdf_jax.stopping import before_stopping
 
     pending = [m for m, o in zip(materials, outcomes, strict=True) if needs_work(o, args.retry_failed)]
     with open_folder(library, args.shard) as progress, before_stopping(lambda word: progress.log(f"stopped: {word}")):
         progress.say(f"{count_states(outcomes)}; {len(pending)} to compute")
+        if library.executor.kind == "slurm" and not args.shard and pending:
+            progress.say(submit(library, pending, overrides, retry_failed=args.retry_failed))
+            return 0
         watch = Watch(outcomes, progress)
         with progress.stage("batch"):
             execute(library.executor, pending, watch, args.retry_failed)
