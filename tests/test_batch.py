@@ -28,8 +28,6 @@ from sbrdf_jax.cli import main
 from sbrdf_jax.options import InputOptions, RunOptions
 from sbrdf_jax.runtime import worker_environment
 
-KILLS = 12
-
 
 @pytest.fixture
 def batch(monkeypatch):
@@ -241,12 +239,13 @@ def test_workers_end_with_their_parent(tmp_path, sent, code):
     assert "Traceback" not in errors
 
 
-def test_random_kills_lose_nothing(tmp_path):
+@pytest.mark.parametrize("wanted", [12, pytest.param(200, marks=pytest.mark.slow)])
+def test_random_kills_lose_nothing(tmp_path, wanted):
     rng = random.Random(11)
     names = [f"m{k:02}" for k in range(40)]
     library = write_library(tmp_path, dict.fromkeys(names, "slow 0.15"))
-    kills, finished = kill_at_random(library, rng, KILLS, seconds=0.5)
-    assert kills == KILLS
+    kills, finished = kill_at_random(library, rng, wanted, seconds=0.5)
+    assert kills == wanted
     with _driver(library) as process:
         assert process.wait(120) == 0
     assert states(library) == dict.fromkeys(names, State.DONE)

@@ -88,3 +88,21 @@ def test_without_slurm_it_is_one_line(tmp_path, monkeypatch, capsys):
 def test_the_script_in_scripts_is_the_template():
     assert (ROOT / "scripts" / "slurm_array.sh").resolve() == ROOT / "sbrdf_jax" / "batch" / "slurm_array.sh"
     assert quick_library.slurm.TEMPLATE.read_text().startswith("#!/bin/sh\n")
+
+
+@pytest.mark.slow
+def test_dask_jobqueue_runs_two_workers_and_survives_a_kill(slurm, tmp_path):
+    pytest.importorskip("dask_jobqueue", reason="the extra cluster is not installed")
+    names = [f"m{k}" for k in range(8)]
+    executor = "{kind: dask, workers: 2, dask: {cluster: slurm, memory: 1GiB, walltime: '00:05'}}"
+    texts = dict.fromkeys(names, "slow 1") | {"m0": "die once"}
+    library = write_library(tmp_path, texts, f"executor: {executor}")
+    program = [sys.executable, str(ROOT / "tests" / "quick_library.py"), str(library)]
+    with open(tmp_path / "shown.txt", "w") as shown:
+        process = subprocess.Popen(program, env=slurm, stderr=shown, cwd=tmp_path)
+        wait_for(lambda: (tmp_path / "out").is_dir() and list((tmp_path / "out").glob("m*.h5")))
+        subprocess.run(["scancel", jobs(slurm)[0]], env=slurm, check=True)
+        assert process.wait(120) == 0, (tmp_path / "shown.txt").read_text()
+    assert {look(material, Memory()).state for material in load_library(library).materials} == {State.DONE}
+    assert not list((tmp_path / "out").glob(".*.tmp"))
+    wait_for(lambda: not jobs(slurm))

@@ -17,6 +17,7 @@ from sbrdf_jax.batch.states import Outcome
 from sbrdf_jax.batch.worker import Work
 from sbrdf_jax.errors import UserError
 
+SECONDS_TO_ANSWER = 10
 JOBQUEUE = {
     "slurm": "SLURMCluster",
     "pbs": "PBSCluster",
@@ -105,9 +106,9 @@ def _start_cluster(workers: int, environment: dict[str, str], options: ExecutorO
     settings = {"queue": wanted.queue, "walltime": wanted.walltime}
     exports = [f"export {name}={value}" for name, value in environment.items()]
     cluster = make(
-        cores=1,
-        job_cpu=threads,
+        cores=threads,
         processes=1,
+        worker_extra_args=["--nthreads", "1"],  # one material at a time, in so many threads
         memory=wanted.memory,
         job_script_prologue=[*wanted.set_up, *exports],
         job_extra_directives=list(wanted.options),
@@ -120,7 +121,7 @@ def _start_cluster(workers: int, environment: dict[str, str], options: ExecutorO
 
 def _connect(distributed: Any, where: Any) -> Any:
     try:
-        return distributed.Client(where)
+        return distributed.Client(where, timeout=SECONDS_TO_ANSWER)
     except (OSError, ValueError) as error:
         found = f"executor.dask.address: found {where!r}, which does not answer ({' '.join(str(error).split())[:120]})"
         raise UserError(f"{found}; expected the address of a scheduler") from None
