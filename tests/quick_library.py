@@ -76,7 +76,7 @@ def _sha256(path: Path) -> str:
 
 
 if __name__ == "__main__":
-    executors.compute_material = compute
+    executors.ComputeMaterial = lambda: compute
     slurm.PROGRAM = (sys.executable, __file__)
     sys.argv[0] = "sbrdf"
     main_exit("batch")

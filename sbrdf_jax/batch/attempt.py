@@ -7,6 +7,7 @@ import dataclasses
 import time
 import traceback
 from collections.abc import Callable
+from typing import Any
 
 from sbrdf_jax.batch.library import Material
 from sbrdf_jax.batch.locks import hold
@@ -56,29 +57,45 @@ def give_up(material: Material, reason: str, memory: Memory) -> Outcome:
     return Outcome(material.name, State.FAILED, reason, computed=True)
 
 
-def compute_material(material: Material) -> None:
-    """Run one material as `sbrdf run` does, with its log beside its result."""
-    start = time.perf_counter()
-    from sbrdf_jax.formats import read
-    from sbrdf_jax.pipeline import prepare
-    from sbrdf_jax.runtime import set_up_jax
-    from sbrdf_jax.single_run import open_progress, run_to_file
-    from sbrdf_jax.stopping import before_stopping
+class ComputeMaterial:
+    """Runs one material after the other as `sbrdf run` does, with its log beside its result.
 
-    set_up_jax()
-    options = material.options
-    with (
-        open_progress(material.result, quiet=True) as progress,
-        before_stopping(lambda word: progress.log(f"stopped: {word}")),
-    ):
-        try:
-            raw = read(options.input.path, options.input)
-            ready = prepare(raw, options)
-            run_to_file(raw, ready, options, progress, time.perf_counter() - start)
-        except Exception:
-            for line in traceback.format_exc().splitlines():
-                progress.log(line)
-            raise
+    It keeps what depends on angles alone for the next; that does not travel to another process.
+    """
+
+    def __init__(self):
+        """Begin with nothing known."""
+        self._geometry: Any = None
+
+    def __call__(self, material: Material) -> None:
+        """Write the result of a material."""
+        start = time.perf_counter()
+        from sbrdf_jax.formats import read
+        from sbrdf_jax.pipeline import prepare
+        from sbrdf_jax.resampling.geometry import Geometry
+        from sbrdf_jax.runtime import set_up_jax
+        from sbrdf_jax.single_run import open_progress, run_to_file
+        from sbrdf_jax.stopping import before_stopping
+
+        set_up_jax()
+        self._geometry = self._geometry or Geometry()
+        options = material.options
+        with (
+            open_progress(material.result, quiet=True) as progress,
+            before_stopping(lambda word: progress.log(f"stopped: {word}")),
+        ):
+            try:
+                raw = read(options.input.path, options.input)
+                ready = prepare(raw, options)
+                run_to_file(raw, ready, options, progress, time.perf_counter() - start, self._geometry)
+            except Exception:
+                for line in traceback.format_exc().splitlines():
+                    progress.log(line)
+                raise
+
+    def __reduce__(self):
+        """Travel without what is known."""
+        return ComputeMaterial, ()
 
 
 def _compute(material: Material, compute: Compute, memory: Memory) -> Outcome:

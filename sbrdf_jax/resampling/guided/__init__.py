@@ -63,6 +63,7 @@ def resample_guided(
     grid: Grid,
     options: ResampleOptions,
     report: Callable[[str], None] | None = None,
+    centres: Centres | None = None,
 ) -> GriddedBRDF:
     """Fit the guided field, and read it and its standard error off at the grid's nodes.
 
@@ -71,8 +72,9 @@ def resample_guided(
         grid: Nodes; bilateral.
         options: As for `fit_field`.
         report: Told of each step.
+        centres: As for `fit_field`.
     """
-    fit = fit_field(samples, options, report)
+    fit = fit_field(samples, options, report, centres)
     value, error = read_nodes(fit.field, grid)
     return GriddedBRDF(
         theta_i=jnp.asarray(grid.theta_i),
