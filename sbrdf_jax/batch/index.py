@@ -68,7 +68,7 @@ def read_memory(folder: Path) -> Memory:
 
 def _write(file: h5py.File, materials: Sequence[Material], outcomes: Sequence[Outcome], memory: Memory) -> None:
     file.attrs["schema_name"], file.attrs["schema_version"] = SCHEMA_NAME, SCHEMA_VERSION
-    columns = ("name", "state", "reason", "failed_lanes", "seconds", "compile_seconds", "worst_error")
+    columns = ("name", "state", "reason", "failed_lanes", "seconds", "compile_seconds", "cpu_seconds", "worst_error")
     _write_table(
         file.create_group("materials"),
         {column: [str(o.state) if column == "state" else getattr(o, column) for o in outcomes] for column in columns},
