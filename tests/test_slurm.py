@@ -11,6 +11,7 @@ import pytest
 import quick_library
 from conftest import IN_CI, ROOT, shared_file
 from quick_library import write_library
+from test_batch_results import assert_same_datasets, small_library
 
 from sbrdf_jax.batch.library import load_library
 from sbrdf_jax.batch.memory import Memory
@@ -106,3 +107,22 @@ def test_dask_jobqueue_runs_two_workers_and_survives_a_kill(slurm, tmp_path):
     assert {look(material, Memory()).state for material in load_library(library).materials} == {State.DONE}
     assert not list((tmp_path / "out").glob(".*.tmp"))
     wait_for(lambda: not jobs(slurm))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("executor", ["slurm", "dask"])
+def test_slurm_and_dask_jobqueue_give_the_datasets_of_a_local_batch(executor, slurm, tmp_path):
+    library = small_library(tmp_path, 8)
+    command = [sys.executable, "-m", "sbrdf_jax.batch", str(tmp_path / "library.yaml"), "executor.threads=1"]
+    command += [f"executor.compile_cache={tmp_path}/compiled"]
+    subprocess.run(command, env=slurm, check=True, cwd=tmp_path)
+    there = [*command, f"output_folder={tmp_path}/there", "--executor", executor]
+    if executor == "dask":
+        dask = "executor.dask={cluster: slurm, memory: 2GiB, walltime: '00:10'}"
+        subprocess.run([*there, "--workers", "2", dask], env=slurm, check=True, cwd=tmp_path)
+    else:
+        subprocess.run(there, env=slurm, check=True, cwd=tmp_path)
+        wait_for(lambda: not jobs(slurm), 500)
+    for material in library.materials:
+        assert_same_datasets(material.result, tmp_path / "there" / material.result.name)
+    assert (tmp_path / "there" / "index.h5").exists()
