@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import multiprocessing
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from multiprocessing import connection
 from typing import Any, Protocol, runtime_checkable
@@ -98,47 +98,67 @@ def run_local(materials: Sequence[Material], work: Work, workers: int, tries: in
     Raises:
         RuntimeError: Workers do not even start.
     """
-    queue = Queue(materials, likeness)
-    deaths: dict[str, int] = {}
-    failed_starts = 0
-    memory = Memory()
-    pool = [_start(work) for _ in range(min(workers, len(materials)))]
+    pool = _Pool(Queue(materials, likeness), work, tries, watcher)
     try:
-        while len(queue) or any(worker.material for worker in pool):
-            for worker in pool:
-                if worker.ready and worker.material is None:
-                    _give(worker, queue, [other.group for other in pool if other is not worker], watcher)
-            readable = connection.wait([worker.connection for worker in pool], SECONDS_BETWEEN_TRIES)
-            for index, worker in enumerate(pool):
-                if worker.connection not in readable:
-                    continue
-                try:
-                    outcome = worker.connection.recv()
-                except (EOFError, OSError):  # it died
-                    pool[index] = _replace(worker, work)
-                    failed_starts += not worker.ready
-                    if failed_starts >= MOST_FAILED_STARTS:
-                        raise RuntimeError(f"workers end before they start, {_how(worker)}") from None
-                    material = worker.material
-                    if material is not None:
-                        deaths[material.name] = deaths.get(material.name, 0) + 1
-                        if deaths[material.name] < tries:
-                            queue.put_back(material)
-                        else:
-                            reason = f"its worker died, {_how(worker)}, {tries} times"
-                            watcher.ended(give_up(material, reason, memory))
-                    continue
-                failed_starts = 0
-                material, worker.material = worker.material, None
-                if not worker.ready:
-                    worker.ready = True
-                elif material is not None and outcome is None:
-                    queue.put_back(material, SECONDS_BETWEEN_TRIES)
-                else:
-                    watcher.ended(outcome)
+        pool.run(min(workers, len(materials)))
     finally:
-        for worker in pool:
+        for worker in pool.workers:
             _stop(worker)
+
+
+class _Pool:
+    """Worker processes, and what is left for them."""
+
+    def __init__(self, queue: Queue, work: Work, tries: int, watcher: Watcher):
+        self.workers: list[_Worker] = []
+        self._queue, self._work, self._tries, self._watcher = queue, work, tries, watcher
+        self._deaths: Counter[str] = Counter()
+        self._failed_starts = 0
+        self._memory = Memory()
+
+    def run(self, count: int) -> None:
+        """Start workers, and give and take until nothing is left."""
+        self.workers += [_start(self._work) for _ in range(count)]
+        while len(self._queue) or any(worker.material for worker in self.workers):
+            for worker in self.workers:
+                if worker.ready and worker.material is None:
+                    others = [other.group for other in self.workers if other is not worker]
+                    _give(worker, self._queue, others, self._watcher)
+            readable = connection.wait([worker.connection for worker in self.workers], SECONDS_BETWEEN_TRIES)
+            for index, worker in enumerate(self.workers):
+                if worker.connection in readable:
+                    try:
+                        answer = worker.connection.recv()
+                    except (EOFError, OSError):  # it died
+                        self.workers[index] = _replace(worker, self._work)
+                        self._bury(worker)
+                    else:
+                        self._take(worker, answer)
+
+    def _take(self, worker: _Worker, answer: Outcome | None) -> None:
+        """Note that a worker is ready, or how it ended its material."""
+        material, worker.material = worker.material, None
+        if not worker.ready:
+            worker.ready, self._failed_starts = True, 0
+        elif answer is not None:
+            self._watcher.ended(answer)
+        elif material is not None:  # another batch is at it
+            self._queue.put_back(material, SECONDS_BETWEEN_TRIES)
+
+    def _bury(self, worker: _Worker) -> None:
+        """Put the material of a dead worker back, or give it up."""
+        self._failed_starts += not worker.ready
+        if self._failed_starts >= MOST_FAILED_STARTS:
+            raise RuntimeError(f"workers end before they start, {_how(worker)}")
+        material = worker.material
+        if material is None:
+            return
+        self._deaths[material.name] += 1
+        if self._deaths[material.name] < self._tries:
+            self._queue.put_back(material)
+        else:
+            reason = f"its worker died, {_how(worker)}, {self._tries} times"
+            self._watcher.ended(give_up(material, reason, self._memory))
 
 
 def likeness(material: Material) -> tuple[object, ...]:
