@@ -61,8 +61,7 @@ def write_result(material: Material, text: str = "") -> None:
         file.attrs["created_utc"] = datetime.now(UTC).isoformat(timespec="seconds")
         value = np.full((3, 2, 2, 4), float(len(material.name)))
         file.create_dataset("grid/brdf", data=value, chunks=(1, 2, 2, 4), fletcher32=True)
-        file["grid/status"] = np.zeros(4, int)
-        file["grid/status"][0] = text == "lane"
+        file["grid/status"] = np.array([int(text == "lane"), 0, 0, 0])
         file["metrics/relative_error"] = np.array([0.01, 0.25])
         file["timing/resample/total"], file["timing/resample/compile"] = 1.5, 0.5
         file.flush()

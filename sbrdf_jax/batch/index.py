@@ -122,6 +122,6 @@ def _write_table(group: h5py.Group, columns: Mapping[str, list]) -> None:
 
 def _read_table(group: h5py.Group) -> list[dict[str, Any]]:
     """Read the rows of a table."""
-    columns = {name: dataset_of(group, name)[()].tolist() for name in group}
+    columns = {name: dataset_of(group, name)[()].tolist() for name in map(str, group)}
     texts = {name: [v.decode() if isinstance(v, bytes) else v for v in values] for name, values in columns.items()}
     return [dict(zip(texts, row, strict=True)) for row in zip(*texts.values(), strict=True)]
