@@ -20,9 +20,11 @@ COMMANDS = {
     "evaluate": "values of a result at given directions",
     "inspect": "what a measurement or a result is",
     "sample": "write the embedded sample as a raw file",
+    "batch": "many materials, as a library file says",
     "report": "figures and a page of one or more results",
     "schema": "JSON schema of the config, for editors",
 }
+STOPPED_BATCH = "finished results stay; the same command goes on from there"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -68,7 +70,8 @@ def main(argv: Sequence[str]) -> int:
 def main_exit(*verb: str) -> None:
     """Run the process's own command line, after `verb` where the module names it, and end the process."""
     argv = [*verb, *sys.argv[1:]]
-    stop_on_signals(" ".join(["sbrdf", *argv[:1]]))
+    remarks = {"remark": STOPPED_BATCH} if argv[:1] == ["batch"] else {}
+    stop_on_signals(" ".join(["sbrdf", *argv[:1]]), **remarks)
     raise SystemExit(main(argv))
 
 

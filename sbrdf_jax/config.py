@@ -14,7 +14,7 @@ from typing import Any
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.option_checks import check_options, describe, option_at
 from sbrdf_jax.options import ErrorBudget, OutgoingOptions, RunOptions, TargetOptions
-from sbrdf_jax.yaml_tree import KeyPath, Tree, dotted, dump_yaml, parse_yaml
+from sbrdf_jax.yaml_tree import KeyPath, Tree, dotted, dump_yaml, graft, parse_yaml
 
 # A row goes when its method arrives: key, which values are refused, and what there is.
 NOT_YET: dict[str, tuple[Callable[[Any], bool], str]] = {
@@ -71,13 +71,34 @@ def load_config(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> 
     Raises:
         UserError: The file or an override is wrong.
     """
-    return parse_config(_read_text(path), overrides, name=os.fspath(path), folder=Path(path).parent)
+    return parse_config(read_text(path), overrides, name=os.fspath(path), folder=Path(path).parent)
 
 
 def parse_config(
     text: str, overrides: Sequence[str] = (), *, name: str = "config", folder: str | os.PathLike[str] = "."
 ) -> RunOptions:
     """Parse the text of a config: `load_config` without the file, with a name for messages and a folder."""
+    tree = parse_tree(text, name=name, folder=folder)
+    for override in overrides:
+        apply_override(tree, override)
+    return options_of(tree)
+
+
+def read_tree(path: str | os.PathLike[str]) -> Tree:
+    """Read a config that overrides may follow: checked, its inputs absolute, `input.path` possibly missing."""
+    return parse_tree(read_text(path), name=os.fspath(path), folder=Path(path).parent)
+
+
+def parse_tree(text: str, *, name: str, folder: str | os.PathLike[str]) -> Tree:
+    """Parse the text of a config: `read_tree` without the file."""
+    tree = parse_file(text, name, "a config, a block of keys such as input.path")
+    check_options(tree, complete=False)
+    make_absolute(tree, folder)
+    return tree
+
+
+def parse_file(text: str, name: str, expected: str) -> Tree:
+    """Parse YAML that is one block of keys; places are `name:line:column: key.path`."""
 
     def place(line: int, column: int, path: KeyPath) -> str:
         return f"{name}:{line}:{column}" + (f": {dotted(path)}" if path else "")
@@ -85,13 +106,17 @@ def parse_config(
     tree = parse_yaml(text, place)
     if not isinstance(tree.data, dict):
         found = "an empty file" if tree.data is None else describe(tree.data)
-        raise UserError(f"{tree.values[()]}: found {found}; expected a config, a block of keys such as input.path")
-    check_options(tree, complete=False)
-    _make_absolute(tree.data, folder)
-    for override in overrides:
-        _override(tree, override)
-        check_options(tree, complete=False)
-    _make_absolute(tree.data, ".")
+        raise UserError(f"{tree.values[()]}: found {found}; expected {expected}")
+    return tree
+
+
+def options_of(tree: Tree) -> RunOptions:
+    """Check a whole config, what holds between its keys too, and return its records.
+
+    Raises:
+        UserError: The config is wrong, or asks for what is not available yet.
+    """
+    make_absolute(tree, ".")
     options = check_options(tree)
     assert options is not None
     for key, problem in _problems(options):
@@ -152,73 +177,81 @@ def check_output(options: RunOptions) -> None:
         raise UserError(f"{where}, which cannot be used ({error.strerror}); expected a file to write") from None
 
 
-def _read_text(path: str | os.PathLike[str]) -> str:
+def read_text(path: str | os.PathLike[str], expected: str = "a YAML config") -> str:
+    """Read a small text file, as UTF-8.
+
+    Raises:
+        UserError: It is missing, too large or no text.
+    """
     name = os.fspath(path)
     try:
         with open(path, "rb") as file:
             raw = file.read(_MAX_BYTES + 1)
     except FileNotFoundError:
-        raise UserError(f"{name}: found no such file; expected a YAML config") from None
+        raise UserError(f"{name}: found no such file; expected {expected}") from None
     except IsADirectoryError:
-        raise UserError(f"{name}: found a folder; expected a YAML config") from None
+        raise UserError(f"{name}: found a folder; expected {expected}") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{name}: found a file that cannot be read ({reason}); expected a YAML config") from None
+        raise UserError(f"{name}: found a file that cannot be read ({reason}); expected {expected}") from None
     if len(raw) > _MAX_BYTES:
-        raise UserError(f"{name}: found more than {_MAX_BYTES} bytes; expected a YAML config")
+        raise UserError(f"{name}: found more than {_MAX_BYTES} bytes; expected {expected}")
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = raw[: error.start].count(b"\n") + 1
         column = error.start - (raw.rfind(b"\n", 0, error.start) + 1) + 1
         found = f"found the byte 0x{raw[error.start]:02x}, which is not UTF-8"
-        raise UserError(f"{name}:{line}:{column}: {found}; expected a YAML config") from None
+        raise UserError(f"{name}:{line}:{column}: {found}; expected {expected}") from None
 
 
-def _override(tree: Tree, text: str) -> None:
-    """Apply one `key.path=value`."""
+def parse_override(text: str) -> tuple[KeyPath, Tree]:
+    """Parse one `key.path=value`: the key path and the value with its places."""
     shown = "".join(c if c.isprintable() else " " for c in text)
     label = f"command line: {shown[:80]}{'...' if len(shown) > 80 else ''}"
     key, equals, value = text.partition("=")
+    if not equals:
+        raise UserError(f"{label}: found no =; expected key.path=value")
+    return parse_value(key, value, label)
+
+
+def parse_value(key: str, value: str, label: str) -> tuple[KeyPath, Tree]:
+    """Parse the value, in YAML, of a dotted key; messages begin with `label`."""
     path: KeyPath = tuple(part.strip() for part in key.split("."))
-    if not equals or not all(path):
-        raise UserError(f"{label}: found no {'key' if equals else '='}; expected key.path=value")
+    if not all(path):
+        raise UserError(f"{label}: found no key; expected key.path=value")
 
     def place(line: int, column: int, inner: KeyPath) -> str:
         return label if inner in ((), path) else f"{label}: {dotted(inner)}"
 
     part = parse_yaml(value, place, path)
-    block = tree.data
-    for number, name in enumerate(path[:-1], start=1):
-        if not isinstance(block.get(name), dict):
-            _forget(tree, path[:number])
-            block[name] = {}
-            tree.keys[path[:number]] = tree.values[path[:number]] = place(1, 1, path[:number])
-        block = block[name]
-    _forget(tree, path)
-    block[path[-1]] = part.data
-    tree.keys[path] = label
-    tree.keys.update(part.keys)
-    tree.values.update(part.values)
+    part.keys[path] = label
+    for number in range(1, len(path)):
+        part.keys[path[:number]] = f"{label}: {dotted(path[:number])}"
+    return path, part
 
 
-def _forget(tree: Tree, path: KeyPath) -> None:
-    """Drop the places of a value that is replaced, so that the order of places stays that of writing."""
-    for places in (tree.keys, tree.values):
-        for old in [old for old in places if old[: len(path)] == path]:
-            del places[old]
+def apply_override(tree: Tree, text: str) -> None:
+    """Apply one `key.path=value`, and check it."""
+    graft(tree, *parse_override(text))
+    check_options(tree, complete=False)
 
 
-def _make_absolute(data: dict[str, Any], folder: str | os.PathLike[str]) -> None:
+def make_absolute(tree: Tree, folder: str | os.PathLike[str]) -> None:
     """Make the paths of inputs absolute; those that already are, and builtin names, stay."""
     for key in _INPUT_PATHS:
         *parents, last = key.split(".")
-        block: Any = data
+        block: Any = tree.data
         for part in parents:
             block = block.get(part) if isinstance(block, dict) else None
         value = block.get(last) if isinstance(block, dict) else None
-        if isinstance(value, str) and value and not value.startswith(BUILTIN):
-            block[last] = os.path.abspath(os.path.join(folder, os.path.expanduser(value)))
+        if isinstance(value, str) and value:
+            block[last] = absolute_input(value, folder)
+
+
+def absolute_input(path: str, folder: str | os.PathLike[str]) -> str:
+    """Return the absolute path of an input that is relative to a folder; a builtin name stays."""
+    return path if path.startswith(BUILTIN) else os.path.abspath(os.path.join(folder, os.path.expanduser(path)))
 
 
 def _place_of(tree: Tree, key: str) -> str:

@@ -7,10 +7,11 @@ pydantic says of a union only what each of its members missed.
 
 import dataclasses
 import difflib
+import functools
 import sys
 import types
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import annotated_types
 import pydantic
@@ -20,8 +21,9 @@ from sbrdf_jax.errors import UserError
 from sbrdf_jax.options import RunOptions
 from sbrdf_jax.yaml_tree import KeyPath, Tree, dotted
 
-_ADAPTER = pydantic.TypeAdapter(RunOptions)
 _NO_DEFAULT = (("input",), ("input", "path"))
+Record = TypeVar("Record")
+WrongItem = tuple[KeyPath, bool, tuple[str | int, ...]]  # place in the data, whether it is missing, pydantic's location
 _YAML_1_1 = {"yes": "true", "on": "true", "no": "false", "off": "false"}
 
 
@@ -34,7 +36,7 @@ _BOUNDS = {
 
 
 def check_options(tree: Tree, *, complete: bool = True) -> RunOptions | None:
-    """Check data against the option records and fill in the defaults.
+    """Check a config against its option records: `check_record`, but for the one key without default.
 
     Args:
         tree: Data of a config and its places.
@@ -48,24 +50,56 @@ def check_options(tree: Tree, *, complete: bool = True) -> RunOptions | None:
     """
     _check_keys(tree, RunOptions, tree.data, ())
     try:
-        # Through JSON, where pydantic is strict about scalars and still takes a mapping for a record.
-        return _ADAPTER.validate_json(pydantic_core.to_json(tree.data, inf_nan_mode="constants"))
+        return _validated(RunOptions, tree)
     except pydantic.ValidationError as error:
-        wrong = [(_path_in(tree.data, item["loc"]), item["type"] == "missing", item["loc"]) for item in error.errors()]
+        wrong = _wrong_items(tree, error, depth=2)
     if not complete:
         wrong = [item for item in wrong if not (item[1] and item[2] in _NO_DEFAULT)]
     if not wrong:
         return None
-    # Of a union every member complains: the deepest place within a key says most.
-    order = {path: number for number, path in enumerate(tree.values)}
-    path, is_missing, location = min(wrong, key=lambda item: (order[item[0][:2]], -len(item[2]), order[item[0]]))
+    path, is_missing, location = wrong[0]
     if is_missing and location in _NO_DEFAULT:
         label = tree.values[path].removesuffix(": " + dotted(path)) if path else tree.values[()]
         raise UserError(f"{label}: input.path: found nothing; expected a file, or builtin:amber_glass")
+    raise _error_of(tree, RunOptions, wrong[0])
+
+
+def check_record(tree: Tree, record: type[Record]) -> Record:
+    """Check data against an option record, and those within it, and fill in the defaults.
+
+    Raises:
+        UserError: The first unknown key, else the first value that is missing or of a wrong type or range.
+    """
+    _check_keys(tree, record, tree.data, ())
+    try:
+        return _validated(record, tree)
+    except pydantic.ValidationError as error:
+        raise _error_of(tree, record, _wrong_items(tree, error, depth=1)[0]) from None
+
+
+@functools.cache
+def _adapter(record: type) -> pydantic.TypeAdapter:
+    return pydantic.TypeAdapter(record)
+
+
+def _validated(record: type, tree: Tree) -> Any:
+    # Through JSON, where pydantic is strict about scalars and still takes a mapping for a record.
+    return _adapter(record).validate_json(pydantic_core.to_json(tree.data, inf_nan_mode="constants"))
+
+
+def _wrong_items(tree: Tree, error: pydantic.ValidationError, depth: int) -> list[WrongItem]:
+    """What pydantic found, the item that says most first: of a union, `depth` keys down, every member complains."""
+    wrong = [(_path_in(tree.data, item["loc"]), item["type"] == "missing", item["loc"]) for item in error.errors()]
+    order = {path: number for number, path in enumerate(tree.values)}
+    return sorted(wrong, key=lambda item: (order[item[0][:depth]], -len(item[2]), order[item[0]]))
+
+
+def _error_of(tree: Tree, record: type, item: WrongItem) -> UserError:
+    path, is_missing, location = item
     if is_missing:
         path = (*path, location[-1])
-        raise UserError(f"{tree.values[path[:-1]]}: found no {path[-1]!r}; expected {_expected_at(path)}")
-    raise UserError(f"{tree.values[path]}: {_wrong_value(path, _value_at(tree.data, path))}")
+        return UserError(f"{tree.values[path[:-1]]}: found no {path[-1]!r}; expected {_expected_at(record, path)}")
+    return UserError(f"{tree.values[path]}: {_wrong_value(record, path, _value_at(tree.data, path))}")
 
 
 def option_at(record: Any, key: str) -> Any:
@@ -77,7 +111,7 @@ def option_at(record: Any, key: str) -> Any:
 
 def json_schema() -> dict[str, Any]:
     """JSON schema (draft 2020-12) of a config, for editors."""
-    schema = _ADAPTER.json_schema()
+    schema = _adapter(RunOptions).json_schema()
     for block in [schema, *schema["$defs"].values()]:
         for key in block["properties"].values():
             key.pop("title", None)
@@ -119,8 +153,9 @@ def describe(value: object) -> str:
     return text if len(text) <= 60 else text[:60] + "..."
 
 
-def _check_keys(tree: Tree, record: type, data: Any, path: KeyPath) -> None:
-    """Refuse keys that a record, or a record within it, does not have."""
+def _check_keys(tree: Tree, record: type, data: Any, path: KeyPath, root: type | None = None) -> None:
+    """Refuse keys that a record, or a record within it, does not have; `root` is the record of the whole file."""
+    root = root or record
     if not isinstance(data, dict):
         return
     hints = _hints(record)
@@ -128,18 +163,22 @@ def _check_keys(tree: Tree, record: type, data: Any, path: KeyPath) -> None:
         here = (*path, key)
         if key not in hints:
             names = ", ".join(hints)
-            raise UserError(f"{tree.keys[here]}: unknown key; expected one of {names}{_meant(key, path, hints)}")
+            raise UserError(f"{tree.keys[here]}: unknown key; expected one of {names}{_meant(key, root, hints)}")
         inner = _record_of(hints[key])
         if inner is not None:
-            _check_keys(tree, inner, value, here)
+            _check_keys(tree, inner, value, here, root)
+        inner = _record_in_list(hints[key])
+        if inner is not None and isinstance(value, list):
+            for index, item in enumerate(value):
+                _check_keys(tree, inner, item, (*here, index), root)
 
 
-def _meant(key: str, path: KeyPath, hints: dict[str, Any]) -> str:
+def _meant(key: str, root: type, hints: dict[str, Any]) -> str:
     """Suggest a key of this block, else one of this very name from elsewhere."""
     near = suggest(key, list(hints))
     if near:
         return near
-    everywhere = [dotted(other) for other in _all_paths(RunOptions, ()) if other[-1] == key]
+    everywhere = [dotted(other) for other in _all_paths(root, ()) if other[-1] == key]
     return f"; did you mean {everywhere[0]!r}?" if everywhere else ""
 
 
@@ -151,6 +190,7 @@ def _all_paths(record: type, path: KeyPath) -> Iterator[KeyPath]:
             yield from _all_paths(inner, (*path, key))
 
 
+@functools.cache
 def _hints(record: type) -> dict[str, Any]:
     hints = get_type_hints(record, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(record)}
@@ -165,6 +205,11 @@ def _members(hint: Any) -> list[Any]:
 
 def _record_of(hint: Any) -> type | None:
     return next((member for member in _members(hint) if dataclasses.is_dataclass(member)), None)  # pyright: ignore
+
+
+def _record_in_list(hint: Any) -> type | None:
+    lists = (_bare(member)[0] for member in _members(hint))
+    return next((_record_of(get_args(member)[0]) for member in lists if get_origin(member) is tuple), None)
 
 
 def _path_in(data: Any, location: tuple[str | int, ...]) -> KeyPath:
@@ -182,8 +227,8 @@ def _value_at(data: Any, path: KeyPath) -> Any:
     return data
 
 
-def _hint_at(path: KeyPath) -> Any:
-    hint: Any = RunOptions
+def _hint_at(root: type, path: KeyPath) -> Any:
+    hint: Any = root
     for part in path:
         if isinstance(part, int):
             lists = (_bare(member)[0] for member in _members(hint))
@@ -195,24 +240,24 @@ def _hint_at(path: KeyPath) -> Any:
     return hint
 
 
-def _wrong_value(path: KeyPath, value: Any) -> str:
-    hint = _hint_at(path)
+def _wrong_value(root: type, path: KeyPath, value: Any) -> str:
+    hint = _hint_at(root, path)
     words = [word for member in _members(hint) if get_origin(member) is Literal for word in get_args(member)]
     meant = suggest(value, [word for word in words if isinstance(word, str)]) if isinstance(value, str) else ""
     if isinstance(value, str) and bool in _members(hint) and value.lower() in _YAML_1_1:
         meant = f"; did you mean {_YAML_1_1[value.lower()]}?"
-    expected = _expected_at(path)
+    expected = _expected_at(root, path)
     if isinstance(value, int | float) and not abs(value) <= sys.float_info.max:
         expected = expected.replace("a number", "a finite number")
     return f"found {describe(value)}; expected {expected}{meant}"
 
 
-def _expected_at(path: KeyPath) -> str:
+def _expected_at(root: type, path: KeyPath) -> str:
     """What a key takes, in words, with the unit that its name says."""
     name = next(part for part in reversed(path) if isinstance(part, str))
     name = str(path[-2]) if name in ("min", "max") else name
     unit = " [deg]" if name.endswith("_deg") else " [nm]" if name.endswith("_nm") else ""
-    return " or ".join(_expected(member, unit) for member in _merged(_members(_hint_at(path))))
+    return " or ".join(_expected(member, unit) for member in _merged(_members(_hint_at(root, path))))
 
 
 def _merged(members: list[Any]) -> list[Any]:
@@ -240,6 +285,8 @@ def _expected(hint: Any, unit: str) -> str:
     if get_origin(bare) is Literal:
         words = [str(word) for word in get_args(bare)]
         return words[0] if len(words) == 1 else "one of " + ", ".join(words)
+    if get_origin(bare) is dict:
+        return "a block of keys"
     if get_origin(bare) is tuple:
         return f"a list, each {_expected(get_args(bare)[0], unit)}"
     bounds = " and ".join(_BOUNDS[type(bound)].format(bound) for bound in constraints)

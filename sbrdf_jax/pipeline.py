@@ -17,6 +17,7 @@ from sbrdf_jax.progress import Progress, StageClock
 from sbrdf_jax.records import STATUS_TEXT, GriddedBRDF, RawSamples, Status
 from sbrdf_jax.representation import represent_with_plan
 from sbrdf_jax.resampling import resample
+from sbrdf_jax.resampling.geometry import Geometry
 from sbrdf_jax.resampling.guided import describe_fit
 from sbrdf_jax.runtime import compile_clock
 from sbrdf_jax.store import RunResult
@@ -63,7 +64,9 @@ def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
     return Prepared(cleaned, grid, rows, tuple(warnings), folds)
 
 
-def process(raw: RawSamples, ready: Prepared, options: RunOptions, progress: Progress) -> RunResult:
+def process(
+    raw: RawSamples, ready: Prepared, options: RunOptions, progress: Progress, geometry: Geometry | None = None
+) -> RunResult:
     """Run every stage on one measurement.
 
     Args:
@@ -71,6 +74,7 @@ def process(raw: RawSamples, ready: Prepared, options: RunOptions, progress: Pro
         ready: What `prepare` made of it.
         options: Resolved options.
         progress: Told of each stage.
+        geometry: What the measurement before it may have worked out, and the next one may use.
 
     Returns:
         The result, but for what only its caller knows: config text, time of creation, versions.
@@ -83,6 +87,7 @@ def process(raw: RawSamples, ready: Prepared, options: RunOptions, progress: Pro
             ready.grid,
             options.resample,
             progress.update,
+            geometry,
         )
     notes = () if gridded.field is None else describe_fit(gridded.field)
 

@@ -37,6 +37,23 @@ def compile_clock() -> Iterator[CompileClock]:
         _clocks.remove(clock)
 
 
+def worker_environment(threads: int, compile_cache: str | None = None) -> dict[str, str]:
+    """Environment of a process that computes in so many threads; to be set before it imports NumPy, JAX or h5py.
+
+    XLA's pool of a processor takes its size from NPROC alone, those of NumPy and SciPy from the
+    others. HDF5's own file locks are off, which some cluster file systems lack: they guard files
+    that are changed in place, and here files are written under another name and renamed.
+    """
+    names = ("NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    environment = {name: str(threads) for name in names} | {"HDF5_USE_FILE_LOCKING": "FALSE"}
+    return environment | ({CACHE_VARIABLE: os.path.abspath(compile_cache)} if compile_cache else {})
+
+
+def usable_cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
 def set_up_jax() -> None:
     """Switch on float64, and the persistent compile cache where `SBRDF_COMPILE_CACHE` names a folder.
 

@@ -25,19 +25,25 @@ def before_stopping(act: Callable[[str], object]) -> Iterator[None]:
         _last_acts.remove(act)
 
 
-def stop_on_signals(name: str) -> None:
+def do_last_acts(word: str) -> None:
+    """Do what the work under way has asked for; for whoever ends the process himself."""
+    for act in reversed(_last_acts):
+        with contextlib.suppress(OSError, RuntimeError):  # of a full disk, of a log line under way
+            act(word)
+
+
+def stop_on_signals(name: str, remark: str = "nothing was written under the output name") -> None:
     """Let SIGINT and SIGTERM end this process with 130 and 143 and one line that starts with `name`.
 
     Args:
         name: The command, as the user knows it.
+        remark: What the line ends with.
     """
 
     def stop(number: int, _frame) -> None:
         code, word = _ENDINGS[signal.Signals(number)]
-        for act in reversed(_last_acts):
-            with contextlib.suppress(OSError, RuntimeError):  # of a full disk, of a log line under way
-                act(word)
-        os.write(2, f"\r{name}: {word}; nothing was written under the output name\n".encode())
+        do_last_acts(word)
+        os.write(2, f"\r{name}: {word}; {remark}\n".encode())
         os._exit(code)
 
     for number in _ENDINGS:

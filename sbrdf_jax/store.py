@@ -5,7 +5,6 @@ Angles are stored in degrees, wavelengths in nm, BRDF values in 1/sr. Every data
 group `compact` alone is enough to evaluate the compact form.
 """
 
-import contextlib
 import dataclasses
 import hashlib
 import json
@@ -46,9 +45,7 @@ from sbrdf_jax.layout import (
 )
 from sbrdf_jax.metrics import METRIC_AXES, METRIC_UNITS
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, SpectralField
-
-SCHEMA_NAME = "sbrdf-result"
-SCHEMA_VERSION = 1
+from sbrdf_jax.schema import SCHEMA_NAME, SCHEMA_VERSION, open_result
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,30 +123,6 @@ def write_metrics(group: h5py.Group, result: RunResult, grid: h5py.Group) -> Non
         default = ("theta_i",) * np.ndim(value)
         names = METRIC_AXES.get(name, default)
         dataset(group, name, value, METRIC_UNITS.get(name, "1"), [axes[axis] for axis in names])
-
-
-@contextlib.contextmanager
-def open_result(path: str | os.PathLike):
-    """Open a result for reading after a look at its schema.
-
-    Raises:
-        UserError: no such file, not an HDF5 file, not a result, or written by a newer version.
-    """
-    if not Path(path).is_file():
-        raise UserError(f"{path}: no such file, expected a result of sbrdf_jax")
-    if not h5py.is_hdf5(path):
-        raise UserError(f"{path}: not an HDF5 file or cut off, expected a result of sbrdf_jax")
-    with h5py.File(path, "r") as file:
-        found = file.attrs.get("schema_name")
-        if found != SCHEMA_NAME:
-            raise UserError(f"{path}: schema_name: found {found!r}, expected {SCHEMA_NAME!r}: this is not a result")
-        version = int(attribute(file, "schema_version"))
-        if version > SCHEMA_VERSION:
-            raise UserError(
-                f"{path}: schema_version: found {version}, expected {SCHEMA_VERSION} or older: "
-                "it was written by a newer sbrdf_jax"
-            )
-        yield file
 
 
 @one_line_errors

@@ -85,6 +85,34 @@ def parse_yaml(text: str, place: Place, root: KeyPath = ()) -> Tree:
         raise UserError(f"{place(1, 1, ())}: found text that is not YAML ({' '.join(str(error).split())})") from None
 
 
+def graft(tree: Tree, path: KeyPath, part: Tree) -> None:
+    """Put a value at a key path, in place of what was there; blocks above it are made where they are missing.
+
+    Args:
+        tree: Changed.
+        path: Where the value goes.
+        part: The value, with its places, and those of the keys above it that may have to be made.
+    """
+    block = tree.data
+    for number, name in enumerate(path[:-1], start=1):
+        if not isinstance(block.get(name), dict):
+            _forget(tree, path[:number])
+            block[name] = {}
+            tree.keys[path[:number]] = tree.values[path[:number]] = part.keys[path[:number]]
+        block = block[name]
+    _forget(tree, path)
+    block[path[-1]] = part.data
+    tree.keys.update({key: place for key, place in part.keys.items() if key[: len(path)] == path})
+    tree.values.update(part.values)
+
+
+def _forget(tree: Tree, path: KeyPath) -> None:
+    """Drop the places of a value that is replaced, so that the order of places stays that of writing."""
+    for places in (tree.keys, tree.values):
+        for old in [old for old in places if old[: len(path)] == path]:
+            del places[old]
+
+
 def dump_yaml(data: Any) -> str:
     """Write plain data as YAML, keys in their order, a key a line."""
     yaml = YAML(typ="safe", pure=True)

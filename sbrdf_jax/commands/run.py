@@ -1,7 +1,6 @@
 """`sbrdf run CONFIG.yaml`: from a measurement to a result, and figures beside it."""
 
 import argparse
-import dataclasses
 import sys
 import time
 import traceback
@@ -39,9 +38,11 @@ def run(args: argparse.Namespace) -> int:
     set_up_jax()
     raw = read(options.input.path, options.input)
 
-    from sbrdf_jax.pipeline import prepare
+    from sbrdf_jax.pipeline import failed_lanes, prepare
     from sbrdf_jax.plan import plan_text
+    from sbrdf_jax.single_run import open_progress, run_to_file
     from sbrdf_jax.stopping import before_stopping
+    from sbrdf_jax.summary import summary_text
 
     ready = prepare(raw, options)
     if args.plan:
@@ -51,7 +52,8 @@ def run(args: argparse.Namespace) -> int:
     with open_progress(output) as progress, before_stopping(lambda word: progress.log(f"stopped: {word}")):
         progress.say(f"{raw.source}: {ready.cleaned.report.num_kept} of {raw.num_samples} samples kept")
         try:
-            return _run(options, raw, ready, progress, time.perf_counter() - start)
+            result = run_to_file(raw, ready, options, progress, time.perf_counter() - start)
+            progress.say("\n" + summary_text(result))
         except UserError as error:
             progress.log(f"stopped: {error}")
             raise
@@ -61,56 +63,7 @@ def run(args: argparse.Namespace) -> int:
             reason = (str(error).splitlines() or [""])[0]
             print(f"sbrdf run: unexpected {type(error).__name__}: {reason}; see {output}.log", file=sys.stderr)
             return UNEXPECTED
-
-
-def open_progress(output: Path):
-    """Open the log `<output>.log`; its folder is made where it is missing.
-
-    Raises:
-        UserError: The log cannot be written, and so neither can the result.
-    """
-    from sbrdf_jax.errors import UserError
-    from sbrdf_jax.progress import Progress
-
-    log = output.with_name(output.name + ".log")
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        return Progress(log)
-    except OSError as error:
-        found = f"found a log that cannot be written ({error.strerror})"
-        raise UserError(f"{log}: {found}; expected a folder to write to") from None
-
-
-def _run(options, raw, ready, progress, set_up_seconds: float) -> int:
-    from datetime import UTC, datetime
-
-    from sbrdf_jax.config import resolved_yaml
-    from sbrdf_jax.pipeline import failed_lanes, process
-    from sbrdf_jax.runtime import versions
-    from sbrdf_jax.store import save
-    from sbrdf_jax.summary import summary_text
-
-    output = Path(options.output.path)
-    result = process(raw, ready, options, progress)
-    set_up = {"set_up": {"total": set_up_seconds, "compile": 0.0, "run": set_up_seconds}}
-    result = dataclasses.replace(
-        result,
-        config=resolved_yaml(options),
-        created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
-        versions=versions(),
-        timing=set_up | dict(result.timing),
-    )
-    with progress.stage("save"):
-        save(output, result)
-        progress.update(str(output))
-    if options.output.report:
-        from sbrdf_jax.report import write_page
-
-        with progress.stage("report"):
-            page = write_page([(output.stem, result)], output.with_name(f"{output.stem}_report"), raw)
-            progress.update(str(page))
-    progress.say("\n" + summary_text(result))
-    failures = failed_lanes(result)
-    for line in failures:
-        progress.say(line)
+        failures = failed_lanes(result)
+        for line in failures:
+            progress.say(line)
     return SOME_LANES_FAILED if failures else 0

@@ -20,7 +20,7 @@ def resample_paper(
     grid: Grid,
     options: ResampleOptions,
     report: Callable[[int, int], None] | None = None,
-    known: InverseNormal | None = None,
+    invert: Callable[[TiedGridNormal], InverseNormal | None] = invert_normal,
 ) -> GriddedBRDF:
     """Fit the non-negative grid whose sinc interpolation is nearest to the samples.
 
@@ -32,15 +32,14 @@ def resample_paper(
         grid: Nodes and ties.
         options: `smoothness_weight` and `tolerance`, both resolved to numbers.
         report: Called with (wavelengths converged, wavelengths) as the solver goes.
-        known: Inverse of A'A from `multipliers.invert_normal`; it depends on the samples'
-            angles, the grid and the weight, so one serves every material of a geometry.
-            Made here where it is not given.
+        invert: Gives the inverse of A'A; it depends on the samples' angles, the grid and the
+            weight, so one serves every material of a geometry.
 
     Returns:
         The grid with its certificate; nowhere negative, one value at each pole.
     """
     operator, rhs = normal_equations(samples, grid, float(options.smoothness_weight))
-    found = solve_normal(operator, rhs, float(options.tolerance), known or invert_normal(operator), report)
+    found = solve_normal(operator, rhs, float(options.tolerance), invert(operator), report)
     return GriddedBRDF(
         theta_i=jnp.asarray(grid.theta_i),
         theta_o=jnp.asarray(grid.theta_o),

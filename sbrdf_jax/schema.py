@@ -1,0 +1,37 @@
+"""What a file of results calls itself, and a first look at one."""
+
+import contextlib
+import os
+from pathlib import Path
+
+import h5py
+
+from sbrdf_jax.errors import UserError
+from sbrdf_jax.hdf5 import attribute
+
+SCHEMA_NAME = "sbrdf-result"
+SCHEMA_VERSION = 1
+
+
+@contextlib.contextmanager
+def open_result(path: str | os.PathLike):
+    """Open a result for reading after a look at its schema.
+
+    Raises:
+        UserError: no such file, not an HDF5 file, not a result, or written by a newer version.
+    """
+    if not Path(path).is_file():
+        raise UserError(f"{path}: no such file, expected a result of sbrdf_jax")
+    if not h5py.is_hdf5(path):
+        raise UserError(f"{path}: not an HDF5 file or cut off, expected a result of sbrdf_jax")
+    with h5py.File(path, "r") as file:
+        found = file.attrs.get("schema_name")
+        if found != SCHEMA_NAME:
+            raise UserError(f"{path}: schema_name: found {found!r}, expected {SCHEMA_NAME!r}: this is not a result")
+        version = int(attribute(file, "schema_version"))
+        if version > SCHEMA_VERSION:
+            raise UserError(
+                f"{path}: schema_version: found {version}, expected {SCHEMA_VERSION} or older: "
+                "it was written by a newer sbrdf_jax"
+            )
+        yield file

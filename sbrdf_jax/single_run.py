@@ -1,0 +1,76 @@
+"""One measurement, prepared, to one result file, and figures beside it."""
+
+import dataclasses
+from datetime import UTC, datetime
+from pathlib import Path
+
+from sbrdf_jax.config import resolved_yaml
+from sbrdf_jax.errors import UserError
+from sbrdf_jax.options import RunOptions
+from sbrdf_jax.pipeline import Prepared, process
+from sbrdf_jax.progress import Progress
+from sbrdf_jax.records import RawSamples
+from sbrdf_jax.resampling.geometry import Geometry
+from sbrdf_jax.runtime import versions
+from sbrdf_jax.store import RunResult, save
+
+
+def open_progress(output: Path, *, quiet: bool = False) -> Progress:
+    """Open the log `<output>.log`; its folder is made where it is missing.
+
+    Raises:
+        UserError: The log cannot be written, and so neither can the result.
+    """
+    log = output.with_name(output.name + ".log")
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        return Progress(log, quiet=quiet)
+    except OSError as error:
+        found = f"found a log that cannot be written ({error.strerror})"
+        raise UserError(f"{log}: {found}; expected a folder to write to") from None
+
+
+def run_to_file(
+    raw: RawSamples,
+    ready: Prepared,
+    options: RunOptions,
+    progress: Progress,
+    set_up_seconds: float,
+    geometry: Geometry | None = None,
+) -> RunResult:
+    """Run every stage, write the result under `output.path`, and its report where that is asked for.
+
+    Args:
+        raw: All rows of a file.
+        ready: What `pipeline.prepare` made of it.
+        options: Resolved options.
+        progress: Told of each stage.
+        set_up_seconds: Seconds up to here, for the result's `timing`.
+        geometry: As for `pipeline.process`.
+
+    Returns:
+        The result, as written.
+
+    Raises:
+        UserError: The result cannot be written.
+    """
+    output = Path(options.output.path)
+    result = process(raw, ready, options, progress, geometry)
+    set_up = {"set_up": {"total": set_up_seconds, "compile": 0.0, "run": set_up_seconds}}
+    result = dataclasses.replace(
+        result,
+        config=resolved_yaml(options),
+        created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        versions=versions(),
+        timing=set_up | dict(result.timing),
+    )
+    with progress.stage("save"):
+        save(output, result)
+        progress.update(str(output))
+    if options.output.report:
+        from sbrdf_jax.report import write_page
+
+        with progress.stage("report"):
+            page = write_page([(output.stem, result)], output.with_name(f"{output.stem}_report"), raw)
+            progress.update(str(page))
+    return result

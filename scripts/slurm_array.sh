@@ -1,0 +1,1 @@
+../sbrdf_jax/batch/slurm_array.sh
