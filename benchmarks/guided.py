@@ -33,7 +33,7 @@ def main(files: list[str]) -> None:
                 start = time.perf_counter()
                 fit = fit_field(samples, options.resample, centres=centres)
                 middle = time.perf_counter()
-                read_nodes(fit.field, ready.grid)
+                read_nodes(fit.field, ready.grid, fit.whiten)
                 end = time.perf_counter()
             row = f"{middle - start:>8.2f} {end - middle:>8.2f} {clock.seconds:>10.2f}"
             print(f"{Path(file).name:<28} {name:<22} {row} {np.max(fit.kkt_residual):>9.1e} {np.max(fit.num_steps):>6}")

@@ -4,10 +4,23 @@ One BLAS thread: two that wait for a core that another process holds take ten ti
 than one that works, and these matrices are too small for a second thread to matter.
 """
 
+import contextlib
+import functools
+
 import numpy as np
 import scipy.linalg.blas
 import scipy.linalg.lapack
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
+
+
+def one_blas_thread() -> contextlib.AbstractContextManager:
+    """Hold the host's BLAS to one thread for a while."""
+    return _controller().limit(limits=1, user_api="blas")
+
+
+@functools.cache
+def _controller() -> ThreadpoolController:
+    return ThreadpoolController()
 
 
 def lower_inverse(prior: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -19,7 +32,7 @@ def whitener(prior: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Inverse W of the lower Cholesky factor of prior plus noise: the inverse is W'W; nan where there is none."""
     total = np.array(prior, order="F")
     total[np.diag_indices_from(total)] += noise
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         factor, failed = scipy.linalg.lapack.dpotrf(total, lower=1, overwrite_a=1)  # zeros above the diagonal
         if failed:
             return np.full_like(total, np.nan)
@@ -28,7 +41,7 @@ def whitener(prior: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
 def lower_product(whiten: np.ndarray) -> np.ndarray:
     """Lower triangle of W'W; what is above is not to be read."""
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         return scipy.linalg.lapack.dlauum(whiten, lower=1)[0]
 
 
@@ -45,7 +58,7 @@ def leave_one_out(lower: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, 
         lower: Lower triangle of C, the inverse of prior plus noise.
         residual: r [centre, wavelength].
     """
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         dual = scipy.linalg.blas.dsymm(1.0, lower, residual, lower=1)
     return dual / np.diag(lower)[:, None], dual
 
@@ -62,7 +75,7 @@ def leave_group_out(lower: np.ndarray, dual: np.ndarray, group: np.ndarray) -> t
     for number in np.unique(group[group >= 0]):
         rows = np.flatnonzero(group == number)
         block = lower_inverse(mirror_lower(lower[np.ix_(rows, rows)]), np.zeros(len(rows)))
-        with threadpool_limits(1, user_api="blas"):
+        with one_blas_thread():
             out[rows] = scipy.linalg.blas.dsymm(1.0, block, dual[rows], lower=1)
         variance[rows] = np.diag(block)
     return out, variance
