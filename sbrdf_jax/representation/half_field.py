@@ -28,7 +28,7 @@ class Block(NamedTuple):
 
 
 class HalfField(NamedTuple):
-    """The nodes, then the midpoints of theta_o and phi_o, then these midway between incident angles."""
+    """The nodes, then the midpoints of theta_o and phi_o, then, of a field, these midway between incident angles."""
 
     blocks: tuple[Block, ...]
     known: Bool[np.ndarray, " theta_i"]  # incident angles that count: finite, not zero throughout, and with data
@@ -66,19 +66,20 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
     weight = np.where(np.arange(count) == count - 1, 1.0, 2.0)  # phi_o = 180 degrees is one node, others have twins
     nodes = _block(theta_i[place], theta_o, phi_o[:count], even[place], weight, share)
     mid_o, mid_phi = _midpoints(theta_o), _midpoints(phi_o[:count])
-    mid_i = _midpoints(theta_i[place]) if field.interpolate_theta_i else np.empty(0)
-    both = np.sort(np.concatenate([theta_i[place], mid_i]))
-    if gridded is not None and gridded.field is not None:
-        finite = np.isin(np.asarray(gridded.field.wavelength_nm), np.asarray(field.basis.wavelength_nm))
-        between = evaluate_on_axes(gridded, both, mid_o, mid_phi)[..., finite]
-    else:
-        between = _interpolate_logarithm(nodes, both, mid_o, mid_phi)
-    step = 2 if len(mid_i) else 1
     twins = np.full(len(mid_phi), 2.0)
-    blocks = [nodes, _block(both[::step], mid_o, mid_phi, between[::step], twins, BETWEEN_WEIGHT * share)]
+    if gridded is None or gridded.field is None:
+        between = _interpolate_logarithm(nodes, mid_o, mid_phi)
+        beside = _block(nodes.theta_i, mid_o, mid_phi, between, twins, BETWEEN_WEIGHT * share)
+        return HalfField((nodes, beside), known, asymmetry)
+    finite = np.isin(np.asarray(gridded.field.wavelength_nm), np.asarray(field.basis.wavelength_nm))
+    mid_i = _midpoints(nodes.theta_i) if field.interpolate_theta_i else np.empty(0)
+    both = np.concatenate([nodes.theta_i, mid_i])
+    between = evaluate_on_axes(gridded, both, mid_o, mid_phi)[..., finite]
+    on, midway = np.split(between, [len(nodes.theta_i)])
+    blocks = [nodes, _block(nodes.theta_i, mid_o, mid_phi, on, twins, BETWEEN_WEIGHT * share)]
     if len(mid_i):
-        midway = BETWEEN_WEIGHT * np.minimum(share[:-1], share[1:])
-        blocks.append(_block(mid_i, mid_o, mid_phi, between[1::2], twins, midway))
+        less = BETWEEN_WEIGHT * np.minimum(share[:-1], share[1:])
+        blocks.append(_block(mid_i, mid_o, mid_phi, midway, twins, less))
     return HalfField(tuple(blocks), known, asymmetry)
 
 
@@ -107,12 +108,11 @@ def _midpoints(axis):
     return (axis[:-1] + axis[1:]) / 2
 
 
-def _interpolate_logarithm(nodes: Block, theta_i, theta_o, phi_o):
-    """Interpolate nodes by monotone cubics through their logarithms, an axis at a time."""
+def _interpolate_logarithm(nodes: Block, theta_o, phi_o):
+    """Interpolate nodes by monotone cubics through their logarithms: in theta_o, then in phi_o.
+
+    Not over theta_i: a peak moves from node to node there, and would be two low ones midway.
+    """
     value = np.log(np.maximum(nodes.brdf, SMALLEST * max(nodes.brdf.max(), 1e-300)))
-    for axis, (old, new) in enumerate(
-        zip((nodes.theta_i, nodes.theta_o, nodes.phi_o), (theta_i, theta_o, phi_o), strict=True)
-    ):
-        if len(old) > 1:
-            value = PchipInterpolator(old, value, axis=axis)(new)
-    return np.exp(value)
+    value = PchipInterpolator(nodes.theta_o, value, axis=1)(theta_o)
+    return np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))

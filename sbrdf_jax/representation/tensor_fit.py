@@ -42,6 +42,13 @@ class Normal(NamedTuple):
     theta_o: Float[np.ndarray, "o theta_o_function"]
 
 
+class Projection(NamedTuple):
+    """Sums over azimuths for a directional factor, for every pair (i, o)."""
+
+    gram: Float[np.ndarray, "i o qq"]
+    moment: Float[np.ndarray, "i o q channel"]
+
+
 class TensorFit:
     """The problem, and its partial solutions: each of the four parts, the others held fixed."""
 
@@ -69,11 +76,16 @@ class TensorFit:
         lines = (np.vander(np.linspace(-1, 1, f.shape[1]), 2)[:, : f.shape[1]] for f in (n.theta_i, n.theta_o))
         return [self.orthonormal(mode, factor) for mode, factor in enumerate((*lines, lobes))]
 
-    def solve_core(self, u, v, w) -> tuple[np.ndarray, np.ndarray]:
+    def project(self, w) -> Projection:
+        """Return what the directional factor makes of Gram matrices and moments."""
+        gram = w.T @ self.normal.gram @ w
+        return Projection(gram.reshape(*gram.shape[:2], -1), w.T @ self.normal.moment)
+
+    def solve_core(self, u, v, projection: Projection) -> tuple[np.ndarray, np.ndarray]:
         """Return the core, and by how much each channel lowers the error."""
-        gram, moment = self._projected(w)
+        gram, moment = projection
         at_i, at_o = self.normal.theta_i @ u, self.normal.theta_o @ v
-        a, b, q, c = u.shape[1], v.shape[1], w.shape[1], moment.shape[3]
+        a, b, q, c = u.shape[1], v.shape[1], moment.shape[2], moment.shape[3]
         matrix = np.tensordot(np.tensordot(_pairs(at_i), gram, (0, 0)), _pairs(at_o), (1, 0))  # [aa, qq, bb]
         matrix = matrix.reshape(a, a, q, q, b, b).transpose(0, 4, 2, 1, 5, 3).reshape(a * b * q, -1)
         right = np.tensordot(np.tensordot(at_i, moment, (0, 0)), at_o, (1, 0))  # [a, q, c, b]
@@ -85,11 +97,10 @@ class TensorFit:
     def sweep(self, factors, channels: int) -> list[np.ndarray]:
         """Renew each factor once, by the first `channels` alone."""
         u, v, w = factors
-        n = self.normal
+        n, projection = self.normal, self.project(w)
         for mode in range(3):
-            core = self.solve_core(u, v, w)[0][..., :channels]
-            gram, moment = self._projected(w)
-            moment = moment[..., :channels]
+            core = self.solve_core(u, v, projection)[0][..., :channels]
+            gram, moment = projection.gram, projection.moment[..., :channels]
             a, b, q, c = core.shape
             if mode == 0:
                 part = np.tensordot(n.theta_o @ v, core, (1, 1)).transpose(0, 2, 3, 1)  # [o, q, c, a]
@@ -117,8 +128,8 @@ class TensorFit:
         at_i, at_o = self.normal.theta_i @ u, self.normal.theta_o @ v
         return np.tensordot(np.tensordot(at_i, core, (1, 0)), at_o, (1, 1)).transpose(0, 3, 1, 2)
 
-    def widened(self, factors, core) -> list[list[np.ndarray] | None]:
-        """Return for each mode the factors with one more column: the leading one of the residual; None at its limit."""
+    def widened(self, factors, core) -> list[np.ndarray | None]:
+        """Return each factor with one more column, the leading one of the residual; None at its limit."""
         u, v, w = factors
         n, channels = self.normal, core.shape[3]
         rest = n.moment[..., :channels] - n.gram @ (w @ self.amplitudes(u, v, core))
@@ -128,7 +139,7 @@ class TensorFit:
             n.theta_o.T @ np.tensordot(along, at_i, (0, 0)).reshape(len(at_o), -1),
             np.tensordot(np.tensordot(rest, at_i, (0, 0)), at_o, (0, 0)).reshape(len(w), -1),
         )
-        found: list[list[np.ndarray] | None] = []
+        found: list[np.ndarray | None] = []
         for mode, (matrix, root) in enumerate(zip(steepest, self.roots, strict=True)):
             others = [f.shape[1] for k, f in enumerate(factors) if k != mode]
             rank = factors[mode].shape[1] + 1
@@ -138,15 +149,8 @@ class TensorFit:
             scaled = scipy.linalg.solve_triangular(root, matrix, trans="T")
             leading = np.linalg.eigh(scaled @ scaled.T)[1][:, -1:]
             column = scipy.linalg.solve_triangular(root, leading)
-            wide = list(factors)
-            wide[mode] = self.orthonormal(mode, np.concatenate([factors[mode], column], axis=1))
-            found.append(wide)
+            found.append(self.orthonormal(mode, np.concatenate([factors[mode], column], axis=1)))
         return found
-
-    def _projected(self, w):
-        """Return Gram matrices [i, o, qq] and moments [i, o, q, channel] of the directional factor."""
-        gram = w.T @ self.normal.gram @ w
-        return gram.reshape(*gram.shape[:2], -1), w.T @ self.normal.moment
 
 
 def _pairs(x):

@@ -34,34 +34,37 @@ def grow(
     for _ in range(FIRST_SWEEPS):
         factors = fit.sweep(factors, channels)
     while True:
-        core, gain = fit.solve_core(*factors)
+        projection = fit.project(factors[2])
+        core, gain = fit.solve_core(*factors[:2], projection)
         error = energy - gain[:channels].sum()
         if error <= NO_ERROR * energy or is_enough(Factors(*factors, core[..., :channels])):
             break
-        size = [f.shape[1] for f in factors]
-        held = numbers(*size, channels)
-        best, step = 0.0, None
-        if channels < len(gain) and numbers(*size, channels + 1) <= budget:
-            best = _gain(error, gain[channels], numbers(*size, channels + 1) - held)
-            step = factors, channels + 1, gain[channels]
-        for wide in fit.widened(factors, core[..., :channels]):
+        held = numbers(*[f.shape[1] for f in factors], channels)
+        steps = []  # score, the error taken away, what it leads to
+        for mode, wide in enumerate(fit.widened(factors, core[..., :channels])):
             if wide is None:
                 continue
-            ranks = [f.shape[1] for f in wide]
-            if np.prod(ranks) > MOST_CELLS or numbers(*ranks, channels) > budget:
+            trial = [wide if k == mode else f for k, f in enumerate(factors)]
+            ranks = [f.shape[1] for f in trial]
+            cost = numbers(*ranks, channels) - held
+            if np.prod(ranks) > MOST_CELLS or held + cost > budget:
                 continue
-            gained = fit.solve_core(*wide)[1][:channels].sum() - gain[:channels].sum()
-            score = _gain(error, gained, numbers(*ranks, channels) - held)
-            if score > best:
-                best, step = score, (wide, channels, gained)
-        if step is None or step[2] < LEAST_GAIN * error:
+            along = fit.project(wide) if mode == 2 else projection
+            gained = fit.solve_core(*trial[:2], along)[1][:channels].sum() - gain[:channels].sum()
+            steps.append((_score(error, gained, cost), gained, trial, channels))
+        if channels < len(gain):
+            cost = numbers(*[f.shape[1] for f in factors], channels + 1) - held
+            if held + cost <= budget:
+                steps.append((_score(error, gain[channels], cost), gain[channels], factors, channels + 1))
+        _, gained, wider, wider_channels = max(steps, key=lambda step: step[0], default=(0.0, 0.0, factors, channels))
+        if gained < LEAST_GAIN * error:
             break
-        factors, channels = fit.sweep(*step[:2]), step[1]
+        factors, channels = fit.sweep(wider, wider_channels), wider_channels
     for _ in range(LAST_SWEEPS):
         factors = fit.sweep(factors, channels)
-    return Factors(*factors, fit.solve_core(*factors)[0][..., :channels])
+    return Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2]))[0][..., :channels])
 
 
-def _gain(error: float, gained: float, cost: int) -> float:
+def _score(error: float, gained: float, cost: int) -> float:
     """Return how far the logarithm of the error falls for each number."""
     return np.log(error / max(error - gained, NO_ERROR * error)) / cost
