@@ -91,6 +91,8 @@ def measure(name: str, *, with_paper: bool) -> dict[str, list[tuple[float, float
         seconds = time.perf_counter() - start
         at_nodes = error_at_nodes(compact, gridded, matching)
         between = error_between(compact, gridded)
+        if name.startswith("true:"):
+            between = error_between_truth(compact, gridded, name.removeprefix("true:"))
         off = [100 * np.nanmedian(value[mask]) for value, mask in (
             (between["relative_error_between"], known),
             (between["relative_error_between_theta_i"], known[:-1] & known[1:]),
@@ -109,7 +111,55 @@ def measure(name: str, *, with_paper: bool) -> dict[str, list[tuple[float, float
     if with_paper:
         compact = represent(encode_field(gridded, make_basis(wavelength_nm, "fourier", 19)), RepresentOptions("paper"))
         report("paper", stored_numbers(compact), error_at_nodes(compact, gridded, matching)["relative_error"])
+    leave_out(gridded, field, known)
     return curves
+
+
+def error_between_truth(compact, gridded, material: str) -> dict[str, np.ndarray]:
+    """Eq. (18) at the midpoints where the truth is known, as `error_between` names it."""
+    from sbrdf_jax.builtin import true_brdf
+    from sbrdf_jax.metrics import midpoints, on_axes
+
+    def at(theta_i):
+        axes = theta_i, midpoints(gridded.theta_o), midpoints(gridded.phi_o)
+        mesh = np.meshgrid(*axes, indexing="ij")
+        truth = np.asarray(true_brdf(material, *mesh, np.asarray(gridded.wavelength_nm)))[0]
+        return np.linalg.norm(on_axes(compact, *axes) - truth) / np.linalg.norm(truth)
+
+    angles = {"": np.asarray(gridded.theta_i), "_theta_i": midpoints(gridded.theta_i)}
+    return {f"relative_error_between{key}": np.array([at(t) for t in value]) for key, value in angles.items()}
+
+
+def leave_out(gridded, field, known) -> None:
+    """Print the error at every second incident angle, left out: lobe tensor beside interpolations of the grid."""
+    from scipy.interpolate import CubicSpline, PchipInterpolator
+
+    from sbrdf_jax.evaluation import evaluate_on_axes
+    from sbrdf_jax.metrics import on_axes
+    from sbrdf_jax.options import RepresentOptions, TargetOptions
+    from sbrdf_jax.representation import represent
+
+    place = np.flatnonzero(known)
+    kept, left = place[::2], place[1::2]
+    left = left[left < kept[-1]]
+    theta_i, brdf = np.asarray(gridded.theta_i), np.asarray(gridded.brdf)
+    part = dataclasses.replace(
+        gridded, theta_i=theta_i[kept], brdf=brdf[kept], extrapolated=np.asarray(gridded.extrapolated)[kept], field=None
+    )
+    spectra = dataclasses.replace(field, theta_i=theta_i[kept], coefficient=np.asarray(field.coefficient)[kept])
+    options = RepresentOptions(method="lobe_tensor", target=TargetOptions(numbers=214))
+    compact = represent(spectra, options, part)
+    logarithm = np.log(np.maximum(brdf[kept], 1e-9))
+    found = {
+        "lobe_tensor": np.stack([on_axes(compact, t, gridded.theta_o, gridded.phi_o) for t in theta_i[left]]),
+        "windowed sinc": evaluate_on_axes(part, theta_i[left], gridded.theta_o, gridded.phi_o),
+        "PCHIP": PchipInterpolator(theta_i[kept], brdf[kept])(theta_i[left]),
+        "log-cubic": np.exp(CubicSpline(theta_i[kept], logarithm)(theta_i[left])),
+    }
+    print("left out " + " ".join(f"{a:>8.4g}" for a in np.degrees(theta_i[left])))
+    for method, value in found.items():
+        error = ((value - brdf[left]) ** 2).sum(axis=(1, 2, 3)) / (brdf[left] ** 2).sum(axis=(1, 2, 3))
+        print(f"  {method:<14}" + " ".join(f"{100 * e:>8.3f}" for e in np.sqrt(error)), flush=True)
 
 
 def draw(curves, path: str) -> None:

@@ -10,7 +10,8 @@ from sbrdf_jax.evaluation import evaluate_on_axes
 from sbrdf_jax.records import GriddedBRDF, SpectralField
 
 UNKNOWN_WEIGHT = 0.01  # of an incident angle without data: it does not count, but is not to run wild
-BETWEEN_WEIGHT = 0.03  # of the error between the nodes, beside that at them
+BETWEEN_WEIGHT = 0.03  # of the error between the nodes, beside that at them, where the field is known there
+GUESS_WEIGHT = 1e-4  # where it is interpolated: enough that nothing runs wild
 RELATIVE_SHARE = 0.03  # of the error relative to each direction's own energy
 RELATIVE_FLOOR = 1e-3  # of the mean energy of a direction
 SMALLEST = 1e-9  # of the largest value; logarithms of less are not taken
@@ -67,10 +68,16 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
     nodes = _block(theta_i[place], theta_o, phi_o[:count], even[place], weight, share)
     mid_o, mid_phi = _midpoints(theta_o), _midpoints(phi_o[:count])
     twins = np.full(len(mid_phi), 2.0)
+    less = np.minimum(share[:-1], share[1:])
     if gridded is None or gridded.field is None:
         between = _interpolate_logarithm(nodes, mid_o, mid_phi)
-        beside = _block(nodes.theta_i, mid_o, mid_phi, between, twins, BETWEEN_WEIGHT * share)
-        return HalfField((nodes, beside), known, asymmetry)
+        blocks = [nodes, _block(nodes.theta_i, mid_o, mid_phi, between, twins, GUESS_WEIGHT * share)]
+        if field.interpolate_theta_i and len(nodes.theta_i) > 1:
+            phi = np.sort(np.concatenate([nodes.phi_o, mid_phi]))
+            tracked, brdf = _along_mirror_track(nodes, phi)
+            both = np.where(np.arange(len(phi)) == len(phi) - 1, 1.0, 2.0)
+            blocks.append(_block(_midpoints(nodes.theta_i), tracked, phi, brdf, both, GUESS_WEIGHT * less))
+        return HalfField(tuple(blocks), known, asymmetry)
     finite = np.isin(np.asarray(gridded.field.wavelength_nm), np.asarray(field.basis.wavelength_nm))
     mid_i = _midpoints(nodes.theta_i) if field.interpolate_theta_i else np.empty(0)
     both = np.concatenate([nodes.theta_i, mid_i])
@@ -78,8 +85,7 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
     on, midway = np.split(between, [len(nodes.theta_i)])
     blocks = [nodes, _block(nodes.theta_i, mid_o, mid_phi, on, twins, BETWEEN_WEIGHT * share)]
     if len(mid_i):
-        less = BETWEEN_WEIGHT * np.minimum(share[:-1], share[1:])
-        blocks.append(_block(mid_i, mid_o, mid_phi, midway, twins, less))
+        blocks.append(_block(mid_i, mid_o, mid_phi, midway, twins, BETWEEN_WEIGHT * less))
     return HalfField(tuple(blocks), known, asymmetry)
 
 
@@ -108,11 +114,36 @@ def _midpoints(axis):
     return (axis[:-1] + axis[1:]) / 2
 
 
-def _interpolate_logarithm(nodes: Block, theta_o, phi_o):
-    """Interpolate nodes by monotone cubics through their logarithms: in theta_o, then in phi_o.
+def _logarithm(nodes: Block):
+    return np.log(np.maximum(nodes.brdf, SMALLEST * max(nodes.brdf.max(), 1e-300)))
 
-    Not over theta_i: a peak moves from node to node there, and would be two low ones midway.
-    """
-    value = np.log(np.maximum(nodes.brdf, SMALLEST * max(nodes.brdf.max(), 1e-300)))
-    value = PchipInterpolator(nodes.theta_o, value, axis=1)(theta_o)
+
+def _interpolate_logarithm(nodes: Block, theta_o, phi_o):
+    """Interpolate nodes by monotone cubics through their logarithms: in theta_o, then in phi_o."""
+    value = PchipInterpolator(nodes.theta_o, _logarithm(nodes), axis=1)(theta_o)
     return np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))
+
+
+def _along_mirror_track(nodes: Block, phi_o) -> tuple[np.ndarray, np.ndarray]:
+    """Return theta_o and values midway between incident angles: cubics through logarithms of four neighbours.
+
+    theta_o moves with theta_i from neighbour to neighbour, so a peak that moves with its mirror
+    direction stays one peak. Where one of the outer two does not exist, the inner two alone.
+    """
+    step, last, slack = np.diff(nodes.theta_i).mean(), nodes.theta_o[-1], 1e-9
+    first = nodes.theta_o[nodes.theta_o + step <= last + slack]
+    along = PchipInterpolator(nodes.theta_o, _logarithm(nodes), axis=1)
+
+    def neighbour(number):  # of each midway angle, by its place before or behind; nan where there is none
+        theta_o = first + number * step
+        value = along(np.clip(theta_o, 0.0, last))
+        value[:, (theta_o < -slack) | (theta_o > last + slack)] = np.nan
+        place = np.arange(len(nodes.theta_i) - 1) + number
+        outside = (place < 0) | (place >= len(nodes.theta_i))
+        return np.where(outside[:, None, None, None], np.nan, value[np.clip(place, 0, len(nodes.theta_i) - 1)])
+
+    before, below, above, behind = (neighbour(number) for number in (-1, 0, 1, 2))
+    linear = (below + above) / 2
+    cubic = linear + (below + above - before - behind) / 16
+    value = np.where(np.isnan(cubic), linear, cubic)
+    return first + step / 2, np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))

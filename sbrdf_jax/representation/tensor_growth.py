@@ -6,7 +6,7 @@ import numpy as np
 
 from sbrdf_jax.representation.tensor_fit import Factors, TensorFit
 
-MOST_CELLS = 700  # of the core for one channel; its normal equations have so many unknowns
+MOST_CELLS = 900  # of the core for one channel; its normal equations have so many unknowns
 LEAST_GAIN = 2e-3  # of the squared error; a step that gains less is noise, and growth ends
 FIRST_SWEEPS, LAST_SWEEPS = 3, 4
 NO_ERROR = 1e-24  # squared, relative; below it is rounding
