@@ -11,7 +11,7 @@ from sbrdf_jax.records import GriddedBRDF, SpectralField
 
 UNKNOWN_WEIGHT = 0.01  # of an incident angle without data: it does not count, but is not to run wild
 BETWEEN_WEIGHT = 0.03  # of the error between the nodes, beside that at them, where the field is known there
-GUESS_WEIGHT = 1e-4  # where it is interpolated: enough that nothing runs wild
+GUESS_WEIGHT = 1e-3  # where it is interpolated: enough that nothing runs wild
 RELATIVE_SHARE = 0.03  # of the error relative to each direction's own energy
 RELATIVE_FLOOR = 1e-3  # of the mean energy of a direction
 SMALLEST = 1e-9  # of the largest value; logarithms of less are not taken
@@ -59,6 +59,8 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
     known = usable.copy()
     if gridded is not None:
         known &= ~np.all(np.asarray(gridded.extrapolated) == 2, axis=(1, 2))
+    if not known.any():
+        known = usable
     if not usable.any():
         return HalfField((), known, 0.0)
     asymmetry = float(np.sqrt((_energy(half - even, np.ones(count))[usable] / energy[usable]).max()))

@@ -117,7 +117,7 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
     columns = np.unique(np.concatenate([block.theta_o for block in half.blocks]))
     if field.interpolate_theta_i:
         low, high = half.nodes.theta_i[[0, -1]]
-        at_rows = spline_weights((rows - low) / max(high - low, 1e-300), layout.functions[0], np)
+        at_rows = spline_weights((rows - low) / (high - low if high > low else 1.0), layout.functions[0], np)
     else:
         at_rows = np.eye(layout.functions[0])[place]
     at_columns = spline_weights(columns * (2 / np.pi), layout.functions[1], np)

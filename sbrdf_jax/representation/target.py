@@ -53,8 +53,9 @@ def median_delta_e(
     wanted: Float[np.ndarray, "i o p wavelength"],
     matching: colour.ColourMatching,
 ) -> Float[np.ndarray, " i"]:
-    """Median colour difference under D65 over the directions of each incident angle."""
+    """Median colour difference under D65 over the nodes of each incident angle, from those on one side."""
     difference = colour.delta_e_2000(found, wanted, matching)
+    difference = np.concatenate([difference, difference[:, :, -2::-1]], axis=2)
     return np.median(difference.reshape(len(difference), -1), axis=1)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-RIDGE = 1e-9  # relative to the diagonal
+RIDGE = 1e-5  # relative to the diagonal: what no value shows stays small, and directions between run not wild
 
 
 class Factors(NamedTuple):
@@ -64,8 +64,8 @@ class TensorFit:
         )
 
     def orthonormal(self, mode: int, factor):
-        """Make the columns of a factor orthonormal over the rows of its mode."""
-        return factor @ np.linalg.inv(np.linalg.qr(self.roots[mode] @ factor)[1])
+        """Make the columns of a factor orthonormal over the rows of its mode, as far as they are independent."""
+        return factor @ np.linalg.pinv(np.linalg.qr(self.roots[mode] @ factor)[1], rcond=1e-10)
 
     def start(self) -> list[np.ndarray]:
         """Return factors of rank 2: constant and linear in both polar angles, the leading lobes in direction."""

@@ -43,4 +43,5 @@ def theta_i_functions(tensor: LobeTensor, theta_i: Float[Array, ""]) -> Float[Ar
         nodes = jnp.asarray(tensor.theta_i)
         return jax.nn.one_hot(jnp.argmin(jnp.abs(theta_i - nodes)), count, dtype=nodes.dtype)
     low, high = jnp.asarray(tensor.theta_i_range)
-    return spline_weights((theta_i - low) / (high - low), count, jnp)
+    width = jnp.where(high > low, high - low, 1.0)  # one incident angle alone: its factors everywhere
+    return spline_weights((theta_i - low) / width, count, jnp)
