@@ -34,7 +34,8 @@ def main(materials: list[str]) -> None:
     from sbrdf_jax.resampling import resample
 
     for material in materials:
-        options = resolve(parse_config(f"input: {{path: builtin:{material}}}\nresample: {{method: paper}}\n"))
+        blocks = "resample: {method: paper}\nrepresent: {method: paper}\n"
+        options = resolve(parse_config(f"input: {{path: builtin:{material}}}\n{blocks}"))
         raw = read(options.input.path, options.input)
         ready = prepare(raw, options)
         gridded = resample(ready.cleaned.samples, ready.grid, options.resample)

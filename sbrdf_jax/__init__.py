@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from sbrdf_jax.cleaning import clean as clean
     from sbrdf_jax.config import load_config as load_config
     from sbrdf_jax.config import resolve as resolve
+    from sbrdf_jax.encoding import data_basis as data_basis
     from sbrdf_jax.encoding import decode as decode
     from sbrdf_jax.encoding import encode as encode
     from sbrdf_jax.encoding import encode_field as encode_field
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from sbrdf_jax.pipeline import process as process
     from sbrdf_jax.records import CompactBRDF as CompactBRDF
     from sbrdf_jax.records import GriddedBRDF as GriddedBRDF
+    from sbrdf_jax.records import LobeTensor as LobeTensor
     from sbrdf_jax.records import RawSamples as RawSamples
     from sbrdf_jax.records import SpectralField as SpectralField
     from sbrdf_jax.records import Status as Status
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
 _HOME = {
     "cleaning": ("clean",),
     "config": ("load_config", "resolve"),
-    "encoding": ("decode", "encode", "encode_field", "make_basis"),
+    "encoding": ("data_basis", "decode", "encode", "encode_field", "make_basis"),
     "errors": ("UserError",),
     "evaluation": ("evaluate", "evaluate_in_chunks"),
     "formats": ("read",),
@@ -49,7 +51,7 @@ _HOME = {
     "lobes": ("lobe_value",),
     "nnls": ("solve_nnls",),
     "pipeline": ("prepare", "process"),
-    "records": ("CompactBRDF", "GriddedBRDF", "RawSamples", "SpectralField", "Status"),
+    "records": ("CompactBRDF", "GriddedBRDF", "LobeTensor", "RawSamples", "SpectralField", "Status"),
     "representation": ("represent",),
     "resampling": ("resample",),
     "store": ("RunResult", "load", "save"),

@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from sbrdf_jax.evaluation import spectral_weights
+from sbrdf_jax.interpolation import spectral_weights
 
 VISIBLE_NM = (380.0, 780.0)
 PRACTICE_NM = (360.0, 780.0)  # the range of ASTM E308

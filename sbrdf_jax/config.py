@@ -22,25 +22,20 @@ NOT_YET: dict[str, tuple[Callable[[Any], bool], str]] = {
         lambda value: value in ("rgl-bsdf", "merl", "astm", "pab", "inplane", "alta"),
         "auto, pbrt, csv, hdf5, nist",
     ),
-    "encode.basis": (lambda value: value == "data", "auto, fourier, cosine, identity"),
-    "represent.method": (lambda value: value in ("lobe_harmonics", "lobe_tensor"), "auto, paper"),
+    "represent.method": (lambda value: value == "lobe_harmonics", "auto, paper, lobe_tensor"),
     "scene": (lambda value: value is not None, "null"),
     "runtime.precision": (lambda value: value == "float32", "float64"),
     "runtime.resume_from": (lambda value: value is not None, "null"),
 }
 
 # What auto means, by method; what is not here stays auto and is decided by the data.
-AUTO_REPRESENT_METHOD = "paper"
 AUTO_RESAMPLE: dict[str, dict[str, Any]] = {
     "paper": {"smoothness_weight": 1.0, "tolerance": 1e-8},
     "guided": {"smoothness_weight": "data", "tolerance": 1e-6},
 }
-AUTO_ENCODE: dict[str, dict[str, Any]] = {"paper": {"basis": "fourier", "coefficients": 19}}
-AUTO_REPRESENT: dict[str, dict[str, Any]] = {
-    "paper": {"max_degree": 4},
-    "lobe_harmonics": {"max_degree": 8},
-    "lobe_tensor": {"max_degree": 8},
-}
+AUTO_BASIS = {"paper": "fourier"}  # else data
+AUTO_COEFFICIENTS = {"data": 12}  # else 19, as in the paper
+AUTO_DEGREE = {"paper": 4}  # else 8
 
 BUILTIN = "builtin:"
 
@@ -127,14 +122,13 @@ def options_of(tree: Tree) -> RunOptions:
 
 def resolve(options: RunOptions) -> RunOptions:
     """Replace every auto that does not need the data by what it stands for."""
-    represent = options.represent
-    if represent.method == "auto":
-        represent = dataclasses.replace(represent, method=AUTO_REPRESENT_METHOD)
+    method = options.represent.method
+    encode = _fill_autos(options.encode, {"basis": AUTO_BASIS.get(method, "data")})
     return dataclasses.replace(
         options,
         resample=_fill_autos(options.resample, AUTO_RESAMPLE[options.resample.method]),
-        encode=_fill_autos(options.encode, AUTO_ENCODE.get(represent.method, {})),
-        represent=_fill_autos(represent, AUTO_REPRESENT[represent.method]),
+        encode=_fill_autos(encode, {"coefficients": AUTO_COEFFICIENTS.get(encode.basis, 19)}),
+        represent=_fill_autos(options.represent, {"max_degree": AUTO_DEGREE.get(method, 8)}),
     )
 
 

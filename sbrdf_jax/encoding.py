@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sbrdf_jax.interpolation import spectral_weights
 from sbrdf_jax.records import GriddedBRDF, SpectralBasis, SpectralField
 
-BASIS_KINDS = ("fourier", "cosine", "identity")
+BASIS_KINDS = ("fourier", "cosine", "data", "identity")
 FEWEST_WAVELENGTHS = 5  # below it a series says less than the samples
 UNIFORM_TOLERANCE = 1e-6  # of the step; wavelengths closer to uniform are taken as uniform
 
@@ -50,6 +51,8 @@ def coefficients_allowed(num_wavelengths: int, wanted: int, kind: str = "fourier
     if num_wavelengths < FEWEST_WAVELENGTHS:
         text = f"{num_wavelengths} wavelengths are too few for a series: the samples themselves are stored"
         return AllowedBasis("identity", num_wavelengths, text)
+    if kind == "data":
+        return AllowedBasis(kind, min(wanted, num_wavelengths), None)
     most = num_wavelengths - 1 - num_wavelengths % 2  # the largest odd number up to n - 1
     used = min(wanted, most)
     if kind == "fourier" and used % 2 == 0:  # a cosine without its sine has no place in eq. (11)
@@ -65,7 +68,7 @@ def make_basis(wavelength_nm: Float[np.ndarray, " wavelength"], kind: str, coeff
 
     Args:
         wavelength_nm: Measured wavelengths [nm], increasing; both ends belong to the domain.
-        kind: One of `BASIS_KINDS`.
+        kind: One of `BASIS_KINDS` but "data", which `data_basis` makes.
         coefficients: Coefficients wanted; `coefficients_allowed` says how many are used, and why.
 
     Returns:
@@ -79,6 +82,8 @@ def make_basis(wavelength_nm: Float[np.ndarray, " wavelength"], kind: str, coeff
     if wavelength_nm.size == 0 or not np.all(step > 0):
         raise ValueError("wavelength_nm: expected one wavelength or more, increasing")
     kind, count, _ = coefficients_allowed(wavelength_nm.size, coefficients, kind)
+    if kind == "data":
+        raise ValueError('basis "data": it follows from a material, by data_basis')
     if kind == "identity":
         return SpectralBasis(wavelength_nm, np.eye(count), np.eye(count), kind, uniform=False)
     synthesis = _series(_position(wavelength_nm, wavelength_nm), kind, count, np)
@@ -89,13 +94,53 @@ def make_basis(wavelength_nm: Float[np.ndarray, " wavelength"], kind: str, coeff
     return SpectralBasis(wavelength_nm, analysis, synthesis, kind, uniform=uniform)
 
 
+def data_basis(
+    wavelength_nm: Float[np.ndarray, " wavelength"],
+    brdf: Float[np.ndarray, "theta_i *direction wavelength"],
+    coefficients: int,
+) -> SpectralBasis:
+    """Return the leading orthonormal spectra of a material, by singular values, on the host.
+
+    Every incident angle is first scaled to unit energy: unscaled, only grazing ones are served.
+
+    Args:
+        wavelength_nm: Measured wavelengths [nm], increasing.
+        brdf: Spectra [1/sr]; incident angles that are not finite or zero throughout do not count.
+        coefficients: Vectors wanted; at most as many as wavelengths.
+
+    Numerics:
+        The sign of each vector is that of its sum, so that equal input gives equal vectors.
+    """
+    spectra = np.asarray(brdf, np.float64).reshape(len(brdf), -1, len(wavelength_nm))
+    energy = np.einsum("idw,idw->i", spectra, spectra)
+    counts = np.isfinite(energy) & (energy > 0)
+    scaled = spectra[counts] / np.sqrt(energy[counts])[:, None, None]
+    vectors = spectral_vectors(scaled.reshape(-1, len(wavelength_nm)))[:coefficients]
+    return vector_basis(wavelength_nm, vectors)
+
+
+def spectral_vectors(spectra: Float[np.ndarray, "row wavelength"]) -> Float[np.ndarray, "vector wavelength"]:
+    """Return all right singular vectors of spectra, the most important first."""
+    vectors = np.linalg.eigh(spectra.T @ spectra)[1][:, ::-1].T
+    return vectors * np.where(vectors.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+
+
+def vector_basis(
+    wavelength_nm: Float[np.ndarray, " wavelength"], vectors: Float[np.ndarray, "coefficient wavelength"]
+) -> SpectralBasis:
+    """Return the basis "data" of orthonormal vectors."""
+    return SpectralBasis(np.asarray(wavelength_nm, np.float64), np.array(vectors.T), np.array(vectors), "data")
+
+
 def coefficient_names(basis: SpectralBasis) -> tuple[str, ...]:
-    """Return the name of each coefficient: a_0, a_1, b_1, ... of eq. (11), c_0, c_1, ..., or the wavelengths."""
+    """Return the name of each coefficient: a_0, a_1, b_1, ... of eq. (11), c_0, ..., v_0, ... or the wavelengths."""
     count = np.shape(basis.synthesis)[0]
     if basis.kind == "fourier":
         return tuple(f"{'ab'[k > 0 and k % 2 == 0]}_{(k + 1) // 2}" for k in range(count))
     if basis.kind == "cosine":
         return tuple(f"c_{k}" for k in range(count))
+    if basis.kind == "data":
+        return tuple(f"v_{k}" for k in range(count))
     return tuple(f"{wavelength:g}nm" for wavelength in np.asarray(basis.wavelength_nm))
 
 
@@ -175,7 +220,8 @@ def decode(
 
     Numerics:
         Between measured wavelengths a series is itself; samples ("identity") are joined by
-        straight lines, which cannot undershoot. Beyond the range a series repeats or mirrors itself.
+        straight lines, which cannot undershoot, vectors ("data") by C1 cubics. Beyond the range
+        a series repeats or mirrors itself.
     """
     synthesis = basis.synthesis if wavelength_nm is None else _functions_at(wavelength_nm, basis)
     return jnp.matmul(coefficient, jnp.asarray(synthesis, coefficient.dtype))
@@ -200,6 +246,8 @@ def mean_spectrum(
     """Return the mean of spectra over the wavelengths [1/sr]: half of the first coefficient of a series."""
     if basis.kind == "identity":
         return coefficient.mean(axis=-1)
+    if basis.kind == "data":
+        return coefficient @ basis.synthesis.mean(axis=1)
     return coefficient[..., 0] / 2
 
 
@@ -222,6 +270,9 @@ def _series(position, kind, count, xp):
 def _functions_at(wavelength_nm, basis):
     """Return the basis' functions at wavelengths, as `synthesis` holds them at the measured ones."""
     measured, count = jnp.asarray(basis.wavelength_nm, wavelength_nm.dtype), basis.synthesis.shape[0]
+    if basis.kind == "data":
+        weights = spectral_weights(wavelength_nm, measured)
+        return jnp.matmul(jnp.asarray(basis.synthesis, weights.dtype), weights.T)
     if basis.kind != "identity":
         return _series(_position(wavelength_nm, measured), basis.kind, count, jnp)
     if count == 1:

@@ -16,8 +16,10 @@ import numpy.typing as npt
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Real
 
 from sbrdf_jax.encoding import decode
-from sbrdf_jax.records import CompactBRDF, GriddedBRDF, SpectralField
+from sbrdf_jax.interpolation import spectral_weights
+from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralField
 from sbrdf_jax.representation.paper import compact_coefficient
+from sbrdf_jax.representation.tensor_value import tensor_value
 from sbrdf_jax.resampling.guided.field import (
     GuidedField,
     each_direction,
@@ -45,7 +47,7 @@ def evaluate(
     the compact form, which is linear between neighbouring incident angles.
 
     Args:
-        result: GriddedBRDF, SpectralField, CompactBRDF, or a record with a registered kernel.
+        result: GriddedBRDF, SpectralField, CompactBRDF, LobeTensor, or a record with a registered kernel.
         theta_i: Polar angle of incidence [rad], 0 to pi/2; the three angles broadcast.
         theta_o: Polar angle of exitance [rad], 0 to pi/2.
         phi_o: Azimuth of exitance [rad], any; the mirror direction is at pi.
@@ -126,6 +128,11 @@ def _(result: CompactBRDF, theta_i, theta_o, phi_o, *, wavelength_nm=None):
     return decode(coefficient, result.basis, wavelength_nm)
 
 
+@direction_kernel.register
+def _(result: LobeTensor, theta_i, theta_o, phi_o, *, wavelength_nm=None):
+    return tensor_value(result, theta_i, theta_o, phi_o, wavelength_nm)
+
+
 def measured_wavelengths(result) -> Float[Array | np.ndarray, " wavelength"]:
     """The measured wavelengths [nm] of a record: its own, or those of its spectral basis."""
     return result.wavelength_nm if hasattr(result, "wavelength_nm") else result.basis.wavelength_nm
@@ -196,48 +203,6 @@ def interpolate_nodes(
 
     zero = jnp.zeros(node_value.shape[-1], node_value.dtype)
     return jax.lax.scan(add_incidence, zero, (along_i, distinct))[0]
-
-
-@jax.jit
-def spectral_weights(
-    wavelength_nm: Float[Array, " query"], nodes_nm: Float[Array, " wavelength"]
-) -> Float[Array, "query wavelength"]:
-    """Weights of C1 cubic (Hermite) interpolation over increasing, possibly uneven, wavelengths.
-
-    Slopes are those of the parabola through three neighbouring nodes, so each interval uses
-    four nodes, the nodes are met exactly and parabolas are reproduced. Two nodes give a
-    straight line, one node a constant. Weights beyond the ends continue the last cubic.
-    """
-    count = nodes_nm.shape[0]
-    if count == 1:
-        return jnp.ones((wavelength_nm.shape[0], 1), nodes_nm.dtype)
-    lower = jnp.clip(jnp.searchsorted(nodes_nm, wavelength_nm, side="right") - 1, 0, count - 2)
-    width = nodes_nm[lower + 1] - nodes_nm[lower]
-    x = (wavelength_nm - nodes_nm[lower]) / width
-    unit, slope = jnp.eye(count, dtype=nodes_nm.dtype), slope_matrix(nodes_nm)
-    value_low, value_high = (1 + 2 * x) * (1 - x) ** 2, x**2 * (3 - 2 * x)
-    slope_low, slope_high = width * x * (1 - x) ** 2, width * x**2 * (x - 1)
-    return (
-        value_low[:, None] * unit[lower]
-        + value_high[:, None] * unit[lower + 1]
-        + slope_low[:, None] * slope[lower]
-        + slope_high[:, None] * slope[lower + 1]
-    )
-
-
-def slope_matrix(nodes: Float[Array, " node"]) -> Float[Array, "node node"]:
-    """Matrix from values at uneven nodes to slopes there, by the parabola through three neighbouring nodes."""
-    count = nodes.shape[0]
-    if count == 2:
-        row = jnp.stack([-1.0 / (nodes[1] - nodes[0]), 1.0 / (nodes[1] - nodes[0])])
-        return jnp.stack([row, row])
-    first = jnp.clip(jnp.arange(count) - 1, 0, count - 3)
-    at, (a, b, c) = nodes, (nodes[first + k] for k in range(3))
-    unit = jnp.eye(count, dtype=nodes.dtype)
-    weight_a = (2 * at - b - c) / ((a - b) * (a - c))
-    weight_b = (2 * at - a - c) / ((b - a) * (b - c))
-    weight_c = (2 * at - a - b) / ((c - a) * (c - b))
-    return weight_a[:, None] * unit[first] + weight_b[:, None] * unit[first + 1] + weight_c[:, None] * unit[first + 2]
 
 
 def evaluate_in_chunks(

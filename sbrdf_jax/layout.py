@@ -9,14 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from sbrdf_jax.cleaning import CleanEntry, CleanReport, Flag
+from sbrdf_jax.compact_layout import read_basis, status_dataset, write_basis
 from sbrdf_jax.coverage import Coverage
-from sbrdf_jax.encoding import coefficient_names, make_basis
-from sbrdf_jax.errors import UserError
-from sbrdf_jax.harmonics import harmonic_orders
+from sbrdf_jax.encoding import coefficient_names
 from sbrdf_jax.hdf5 import attribute, dataset, dataset_of, degrees, read, read_mapping, scale, write_mapping
-from sbrdf_jax.lobes import LOBE_KINDS
-from sbrdf_jax.metrics import stored_numbers
-from sbrdf_jax.records import STATUS_TEXT, CompactBRDF, GriddedBRDF, SpectralBasis, SpectralField, Status
+from sbrdf_jax.records import GriddedBRDF, SpectralField
 from sbrdf_jax.resampling.guided.error_model import ResidualScale
 from sbrdf_jax.resampling.guided.field import GuidedField
 from sbrdf_jax.resampling.guided.lobe_model import SHAPE_NAMES, LobeModel
@@ -73,39 +70,11 @@ def write_guided(group: h5py.Group, field: GuidedField) -> None:
 def write_field(group: h5py.Group, field: SpectralField, grid: h5py.Group) -> None:
     """Write the spectral coefficients at the nodes of the grid."""
     names = coefficient_names(field.basis)
-    index = scale(group, "coefficient", np.arange(len(names)), "1")
+    index = write_basis(group, field.basis, dataset_of(grid, "wavelength_nm"))
     axes = [dataset_of(grid, f"{name}_deg") for name in _ANGLES]
     written = dataset(group, "coefficients", field.coefficient, "1/sr", [*axes, index])
     written.attrs["basis"] = field.basis.kind
     written.attrs["coefficient_order"] = ",".join(names)
-
-
-def write_compact(group: h5py.Group, compact: CompactBRDF) -> None:
-    """Write all that evaluation of the compact stage needs, and how each lane ended."""
-    orders = harmonic_orders(compact.max_degree)
-    names = coefficient_names(compact.basis)
-    group.attrs["method"] = "paper"
-    group.attrs["stored_numbers"] = stored_numbers(compact)
-    group.attrs["basis"] = compact.basis.kind
-    group.attrs["max_degree"] = compact.max_degree
-    group.attrs["interpolate_theta_i"] = bool(compact.interpolate_theta_i)
-    theta_i = scale(group, "theta_i_deg", degrees(compact.theta_i), "deg")
-    scale(group, "wavelength_nm", compact.basis.wavelength_nm, "nm")
-    coefficient = scale(group, "coefficient", np.arange(len(names)), "1")
-    coefficient.attrs["coefficient_order"] = ",".join(names)
-    harmonic = scale(group, "harmonic", np.arange(len(orders)), "1")
-    lane = [theta_i, coefficient]
-    background = dataset(group, "background", compact.background, "1/sr", [*lane, harmonic])
-    background.attrs["harmonic_order"] = np.array(orders)  # rows of (l, m)
-    background.attrs["coefficient_order"] = ",".join(names)
-    kind = dataset(group, "lobe_kind", np.asarray(compact.lobe_kind, np.int64), "1", lane)
-    kind.attrs["names"] = ",".join(LOBE_KINDS)
-    dataset(group, "lobe_height", compact.lobe_height, "1/sr", lane)
-    width = dataset(group, "lobe_width", compact.lobe_width, "1", lane)
-    width.attrs["meaning"] = "b of eqs. (14) to (16): rad^2 for angle_squared, else without unit"
-    dataset(group, "critical_angle_deg", degrees(compact.critical_angle), "deg", lane)
-    status_dataset(group, compact.status, lane)
-    dataset(group, "lobe_peak_theta_o_deg", degrees(compact.lobe_peak_theta_o), "deg", [theta_i])
 
 
 def write_cleaning(group: h5py.Group, report: CleanReport) -> None:
@@ -152,13 +121,6 @@ def write_validation(group: h5py.Group, validation: Mapping[str, np.ndarray], gr
             written.attrs["meaning"] = SCORE_TEXT[last]
 
 
-def status_dataset(group: h5py.Group, status, axes: list[h5py.Dataset]) -> None:
-    """Write a status per lane, with the name and the meaning of each number."""
-    written = dataset(group, "status", np.asarray(status, np.int64), "1", axes)
-    written.attrs["names"] = ",".join(s.name.lower() for s in Status)
-    written.attrs["meaning"] = json.dumps({s.name.lower(): STATUS_TEXT[s] for s in Status})
-
-
 def read_guided(group: h5py.Group) -> GuidedField:
     """Read the guided field."""
     stored = read_mapping(group)
@@ -197,9 +159,9 @@ def read_grid(group: h5py.Group, field: h5py.Group | None = None) -> GriddedBRDF
 
 
 def read_field(group: h5py.Group, gridded: GriddedBRDF) -> SpectralField:
-    """Read the spectral coefficients; their basis follows from its kind, the wavelengths and the count."""
+    """Read the spectral coefficients and their basis."""
     stored = dataset_of(group, "coefficients")
-    basis = read_basis(attribute(stored, "basis"), np.asarray(gridded.wavelength_nm), stored.shape[-1])
+    basis = read_basis(group, attribute(stored, "basis"), np.asarray(gridded.wavelength_nm), stored.shape[-1])
     shape = (*np.shape(gridded.brdf)[:3], stored.shape[-1])
     return SpectralField(
         gridded.theta_i,
@@ -210,37 +172,6 @@ def read_field(group: h5py.Group, gridded: GriddedBRDF) -> SpectralField:
         window=gridded.window,
         interpolate_theta_i=gridded.interpolate_theta_i,
     )
-
-
-def read_compact(group: h5py.Group) -> CompactBRDF:
-    """Read the compact form from its group alone."""
-    method = str(attribute(group, "method"))
-    if method != "paper":
-        raise UserError(f"{group.file.filename}: compact: method: found {method!r}, expected 'paper'")
-    theta_i, wavelength_nm = read(group, "theta_i_deg"), read(group, "wavelength_nm")
-    max_degree = int(attribute(group, "max_degree"))
-    lanes = (len(theta_i), len(read(group, "coefficient")))
-    return CompactBRDF(
-        theta_i=np.deg2rad(theta_i),
-        basis=read_basis(attribute(group, "basis"), wavelength_nm, lanes[1]),
-        background=read(group, "background", (*lanes, (max_degree + 1) ** 2)),
-        lobe_kind=read(group, "lobe_kind", lanes),
-        lobe_height=read(group, "lobe_height", lanes),
-        lobe_width=read(group, "lobe_width", lanes),
-        critical_angle=np.deg2rad(read(group, "critical_angle_deg", lanes)),
-        lobe_peak_theta_o=np.deg2rad(read(group, "lobe_peak_theta_o_deg", lanes[:1])),
-        status=read(group, "status", lanes),
-        max_degree=max_degree,
-        interpolate_theta_i=bool(attribute(group, "interpolate_theta_i")),
-    )
-
-
-def read_basis(kind: str, wavelength_nm: np.ndarray, count: int) -> SpectralBasis:
-    """Make the spectral basis again that was stored by kind and count."""
-    basis = make_basis(wavelength_nm, str(kind), count)
-    if np.shape(basis.synthesis)[0] != count:
-        raise ValueError(f"{len(wavelength_nm)} wavelengths cannot carry {count} coefficients of basis {kind}")
-    return basis
 
 
 def read_cleaning(group: h5py.Group) -> CleanReport:

@@ -16,10 +16,11 @@ from sbrdf_jax import colour
 from sbrdf_jax.angles import angle_between
 from sbrdf_jax.encoding import decode
 from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_on_axes, measured_wavelengths
-from sbrdf_jax.records import CompactBRDF, GriddedBRDF, SpectralField
+from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralBasis, SpectralField
+from sbrdf_jax.representation import lobe_tensor
 from sbrdf_jax.representation.paper import compact_coefficient
+from sbrdf_jax.representation.target import PAPER_DIRECTIONS
 
-PAPER_DIRECTIONS = 13 * 49  # the paper's nodes of one incident angle, copies at the pole and at 360 degrees counted
 NUM_RANDOM_DIRECTIONS = 4096
 CHUNK_SIZE = 1024  # one shape for all compact evaluations here: they compile once
 ALBEDO_THETA, ALBEDO_PHI = 48, 96  # fewest quadrature points; two a node on finer grids
@@ -44,7 +45,7 @@ class Metrics:
 def measure(
     gridded: GriddedBRDF,
     field: SpectralField | None = None,
-    compact: CompactBRDF | None = None,
+    compact: CompactBRDF | LobeTensor | None = None,
     *,
     absolute: bool = True,
     seed: int = 0,
@@ -107,7 +108,7 @@ def relative_deviation(reconstructed: np.ndarray, original: np.ndarray) -> np.nd
     return np.where(reconstructed == original, 0.0, deviation)
 
 
-def error_at_nodes(compact: CompactBRDF, gridded: GriddedBRDF, matching: colour.ColourMatching) -> dict:
+def error_at_nodes(compact: CompactBRDF | LobeTensor, gridded: GriddedBRDF, matching: colour.ColourMatching) -> dict:
     """Compare compact form and grid at the grid's nodes: eq. (18), median relative error, Delta E 2000 under D65.
 
     All nodes count, copies at the poles and at 360 degrees included, as the paper counts;
@@ -141,7 +142,7 @@ def live_wavelengths(gridded: GriddedBRDF) -> np.ndarray:
     return np.all(np.isfinite(np.asarray(gridded.brdf)), axis=(0, 1, 2))
 
 
-def error_between(compact: CompactBRDF, gridded: GriddedBRDF) -> dict:
+def error_between(compact: CompactBRDF | LobeTensor, gridded: GriddedBRDF) -> dict:
     """Eq. (18) at cell midpoints of theta_o and phi_o, against the grid stage there; and with theta_i midway too.
 
     Midway between incident angles it is NaN where the grid interpolates nothing over them.
@@ -163,15 +164,18 @@ def error_between(compact: CompactBRDF, gridded: GriddedBRDF) -> dict:
     }
 
 
-def error_split(compact: CompactBRDF, field: SpectralField, gridded: GriddedBRDF) -> dict:
+def error_split(compact: CompactBRDF | LobeTensor, field: SpectralField, gridded: GriddedBRDF) -> dict:
     """Split the error at the nodes into spectral truncation, background and lobe, each as an eta of eq. (18).
 
+    Of a lobe tensor only the first, by the spectra that it stores.
     Spectral: the grid against its own truncated spectra. The rest is the misfit of the
     coefficients, which belongs to the lobe within the lane's critical angle and to the
     background elsewhere, and everywhere in lanes without a lobe. Squares add up to that of
     the whole but for cross terms, which are small because the bases are nearly orthogonal.
     """
     live = live_wavelengths(gridded)
+    if isinstance(compact, LobeTensor):
+        return {"error_spectral": truncation_error(compact.basis, np.asarray(gridded.brdf)[..., live])}
     parts = {"error_spectral": [], "error_background": [], "error_lobe": []}
     for i in range(len(gridded.theta_i)):
         original = np.asarray(gridded.brdf[i])[..., live]
@@ -180,6 +184,15 @@ def error_split(compact: CompactBRDF, field: SpectralField, gridded: GriddedBRDF
         for name, error in zip(parts, slice_parts, strict=True):
             parts[name].append(relative_error(float(error), energy))
     return {name: np.array(values) for name, values in parts.items()}
+
+
+def truncation_error(
+    basis: SpectralBasis, brdf: Float[np.ndarray, "theta_i theta_o phi_o wavelength"]
+) -> Float[np.ndarray, " theta_i"]:
+    """Eq. (18) of spectra against their best approximation in a basis, which least squares finds."""
+    columns = np.linalg.qr(np.asarray(basis.synthesis, np.float64).T)[0]
+    rest = brdf - brdf @ columns @ columns.T
+    return relative_error((rest**2).sum(axis=(1, 2, 3)), (brdf**2).sum(axis=(1, 2, 3)))
 
 
 @jax.jit
@@ -199,30 +212,34 @@ def _slice_split(compact, field, original, i):
     return tuple((part**2).sum() for part in (spectral, background, lobe))
 
 
-def stored_numbers(compact: CompactBRDF) -> int:
+def stored_numbers(compact: CompactBRDF | LobeTensor) -> int:
     """Count all numbers that the `compact` group of a result holds, its axes included.
 
-    The matrices of the spectral basis are not stored: they follow from kind, wavelengths and count.
+    The matrices of the spectral basis are not stored but for the vectors of "data": they follow
+    from kind, wavelengths and count.
     """
+    if isinstance(compact, LobeTensor):
+        return lobe_tensor.stored_numbers(compact)
     fields = ("theta_i", "background", "lobe_kind", "lobe_height", "lobe_width", "critical_angle", "lobe_peak_theta_o")
     held = sum(np.size(getattr(compact, name)) for name in (*fields, "status"))
     num_coefficients, num_harmonics = np.shape(compact.background)[1:]
-    return held + np.size(compact.basis.wavelength_nm) + num_coefficients + num_harmonics
+    vectors = np.size(compact.basis.synthesis) if compact.basis.kind == "data" else 0
+    return held + np.size(compact.basis.wavelength_nm) + num_coefficients + num_harmonics + vectors
 
 
-def compression(compact: CompactBRDF) -> dict:
+def compression(compact: CompactBRDF | LobeTensor) -> dict:
     """Numbers of the grid at the paper's 13 x 49 x wavelengths an incident angle over the numbers of the compact form.
 
     Only 13 x 49 - 60 of those directions are distinct, and half of them are mirror images.
     `compression_ratio` counts everything that is stored; `compression_ratio_paper` only
-    harmonics, height and width, as the paper does.
+    harmonics, height and width, as the paper does, of its form alone.
     """
-    num_theta_i, num_coefficients, num_harmonics = np.shape(compact.background)
     grid = PAPER_DIRECTIONS * np.size(compact.basis.wavelength_nm)
-    return {
-        "compression_ratio": num_theta_i * grid / stored_numbers(compact),
-        "compression_ratio_paper": grid / ((num_harmonics + 2) * num_coefficients),
-    }
+    everything = {"compression_ratio": np.size(compact.theta_i) * grid / stored_numbers(compact)}
+    if isinstance(compact, LobeTensor):
+        return everything
+    _, num_coefficients, num_harmonics = np.shape(compact.background)
+    return everything | {"compression_ratio_paper": grid / ((num_harmonics + 2) * num_coefficients)}
 
 
 def off_node_scores(result, *, seed: int = 0) -> tuple[float, float, float]:

@@ -86,9 +86,10 @@ class EncodeOptions:
     __pydantic_config__ = _STRICT
 
     basis: Literal["auto", "fourier", "cosine", "data", "identity"] = "auto"
-    """Functions of wavelength; auto: fourier for paper, else chosen by represent."""
+    """Functions of wavelength; data: vectors found in the material; auto: fourier for paper, else data."""
     coefficients: Auto | Annotated[int, Ge(1), Le(9999)] = "auto"
-    """Real numbers per spectrum, odd for fourier; auto: 19 for paper. Not used by identity."""
+    """Real numbers per spectrum, odd for fourier; auto: 12 for data (of which represent takes as many as pay), else 19.
+    Not used by identity."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,8 @@ class RepresentOptions:
     __pydantic_config__ = _STRICT
 
     method: Literal["auto", "paper", "lobe_harmonics", "lobe_tensor"] = "auto"
-    """paper: equations 13 to 16 of Xu's paper; auto: the smallest that meets the target."""
+    """paper: equations 13 to 16 of Xu's paper; lobe_tensor: this project's own; auto: the smallest that meets the
+    target."""
     target: TargetOptions = TargetOptions(ratio=125.0)
     """What to meet; ignored by paper."""
     max_degree: Auto | Annotated[int, Ge(0), Le(32)] = "auto"

@@ -7,14 +7,14 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from sbrdf_jax.cleaning import CleanResult, clean
-from sbrdf_jax.encoding import coefficients_allowed, encode_field, make_basis
+from sbrdf_jax.encoding import coefficients_allowed, data_basis, encode_field, make_basis
 from sbrdf_jax.folds import LEAVE_ONE_OUT, Folds, make_folds
 from sbrdf_jax.grid import Grid, make_grid
 from sbrdf_jax.metrics import live_wavelengths, measure
-from sbrdf_jax.options import RunOptions
+from sbrdf_jax.options import EncodeOptions, RunOptions
 from sbrdf_jax.plan import PlanRow, plan_run, plan_validation
 from sbrdf_jax.progress import Progress, StageClock
-from sbrdf_jax.records import STATUS_TEXT, GriddedBRDF, RawSamples, Status
+from sbrdf_jax.records import STATUS_TEXT, GriddedBRDF, RawSamples, SpectralBasis, Status
 from sbrdf_jax.representation import represent_with_plan
 from sbrdf_jax.resampling import resample
 from sbrdf_jax.resampling.geometry import Geometry
@@ -93,13 +93,14 @@ def process(
 
     live = finite_part(gridded)
     with _timed(progress, timing, "encode"):
-        basis = make_basis(np.asarray(live.wavelength_nm), options.encode.basis, int(options.encode.coefficients))
+        basis = spectral_basis(live, options.encode)
         field = encode_field(live, basis)
         used = np.shape(field.coefficient)[-1]
         progress.update(f"{used} coefficients, basis {basis.kind}")
 
     with _timed(progress, timing, "represent"):
-        compact, searched = represent_with_plan(field, options.represent)
+        compact, searched = represent_with_plan(field, options.represent, live)
+        missed = tuple(searched.pop("warnings", ()))
         progress.update(count_statuses(compact.status))
 
     with _timed(progress, timing, "measure"):
@@ -131,9 +132,20 @@ def process(
             "coefficients_used": used,
         },
         timing=timing,
-        warnings=ready.warnings + notes + metrics.warnings,
+        warnings=ready.warnings + notes + missed + metrics.warnings,
         source_sha256=raw.source_sha256,
     )
+
+
+def spectral_basis(gridded: GriddedBRDF, options: EncodeOptions) -> SpectralBasis:
+    """Return the spectral basis that the options name; that of the data from the incident angles that have any."""
+    wavelength_nm, wanted = np.asarray(gridded.wavelength_nm), int(options.coefficients)
+    allowed = coefficients_allowed(len(wavelength_nm), wanted, options.basis)
+    if allowed.kind != "data":
+        return make_basis(wavelength_nm, allowed.kind, wanted)
+    known = ~np.all(np.asarray(gridded.extrapolated) == 2, axis=(1, 2))
+    brdf = np.asarray(gridded.brdf)
+    return data_basis(wavelength_nm, brdf[known] if known.any() else brdf, allowed.coefficients)
 
 
 def finite_part(gridded: GriddedBRDF) -> GriddedBRDF:
@@ -173,8 +185,8 @@ def _lane_name(result: RunResult, stage: str, index: np.ndarray) -> str:
         return f"{np.asarray(result.gridded.wavelength_nm)[index[0]]:g} nm"
     if stage.startswith("validate"):
         return f"fit {index[0] + 1}, {np.asarray(result.gridded.wavelength_nm)[index[1]]:g} nm"
-    theta_i = np.rad2deg(np.asarray(result.gridded.theta_i)[index[0]])
-    return f"theta_i {theta_i:g} degrees, coefficient {index[1]}"
+    theta_i = f"theta_i {np.rad2deg(np.asarray(result.gridded.theta_i)[index[0]]):g} degrees"
+    return theta_i if len(index) == 1 else f"{theta_i}, coefficient {index[1]}"
 
 
 @contextlib.contextmanager

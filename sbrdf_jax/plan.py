@@ -44,19 +44,24 @@ def plan_run(kept: RawSamples, num_read: int, grid: Grid, coefficients: int, opt
     if options.resample.method == "guided":
         distinct = len(grid.theta_i) * len(grid.theta_o) * grid.num_azimuths
         solved = PlanRow("resample", "nodes", distinct, nodes, "phi_o folded; read off the fitted field")
+    represent = [PlanRow("represent", "lanes", len(grid.theta_i), len(grid.theta_i), "incident angles, all at once")]
+    if options.represent.method == "paper":
+        represent = [
+            PlanRow("represent", "lanes", lanes, lanes, "incident angles x coefficients"),
+            PlanRow(
+                "represent",
+                "lobe fits, at most",
+                lanes * CRITICAL_ANGLES * kinds,
+                lanes * CRITICAL_ANGLES * 3,
+                "lanes that the background explains are skipped",
+            ),
+        ]
     return [
         PlanRow("clean", "samples", kept.num_samples, num_read, "what is dropped is listed by reason"),
         solved,
         PlanRow("resample", "wavelengths", wavelengths, wavelengths, "no scene: every wavelength"),
         PlanRow("encode", "coefficients", coefficients, wavelengths, f"basis {options.encode.basis}"),
-        PlanRow("represent", "lanes", lanes, lanes, "incident angles x coefficients"),
-        PlanRow(
-            "represent",
-            "lobe fits, at most",
-            lanes * CRITICAL_ANGLES * kinds,
-            lanes * CRITICAL_ANGLES * 3,
-            "lanes that the background explains are skipped",
-        ),
+        *represent,
     ]
 
 

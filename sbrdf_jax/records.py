@@ -97,8 +97,9 @@ class SpectralBasis:
     """The functions of wavelength whose coefficients stand for a spectrum.
 
     kind "fourier": eq. (11), coefficients a_0, a_1, b_1, a_2, b_2, ...; "cosine": the even
-    extension, c_0, c_1, ...; "identity": the samples themselves. The measured wavelengths
-    are kept, because they are the domain and, for "identity", the nodes.
+    extension, c_0, c_1, ...; "identity": the samples themselves; "data": orthonormal vectors
+    found in a material, by importance. The measured wavelengths are kept, because they are the
+    domain and, for "identity" and "data", the nodes.
     """
 
     wavelength_nm: Any  # [wavelength]
@@ -139,4 +140,26 @@ class CompactBRDF:
     lobe_peak_theta_o: Any  # [theta_i] rad, at phi_o = pi
     status: Any  # [theta_i, coefficient] Status
     max_degree: int = 4
+    interpolate_theta_i: bool = True
+
+
+@pytree(static=("half_angle_floor", "interpolate_theta_i"))
+class LobeTensor:
+    """A Tucker decomposition over theta_i, theta_o, a directional factor with all lobes, and the spectrum.
+
+    The coefficients of the spectrum are exp(-log_scale) times the core, contracted with a factor
+    of splines of theta_i, one of splines of theta_o and one of `direction_functions`; the spectrum
+    is clipped at 0. Incident angles beyond `theta_i_range` take the factors of its ends.
+    """
+
+    theta_i: Any  # [theta_i] rad, nodes of the grid
+    theta_i_range: Any  # [2] rad, first and last incident angle with data
+    basis: SpectralBasis
+    log_scale: Any  # [theta_i_function] logarithm of sr
+    theta_i_factor: Any  # [theta_i_function, a]
+    theta_o_factor: Any  # [theta_o_function, b]
+    direction_factor: Any  # [direction_function, q]
+    core: Any  # [a, b, q, coefficient]
+    status: Any  # [theta_i] Status; SKIPPED where an incident angle has no data
+    half_angle_floor: float = 1e-4
     interpolate_theta_i: bool = True

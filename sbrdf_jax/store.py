@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 
 from sbrdf_jax.cleaning import CleanReport
+from sbrdf_jax.compact_layout import read_compact, write_compact
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.files import whole_file
 from sbrdf_jax.hdf5 import (
@@ -33,18 +34,16 @@ from sbrdf_jax.hdf5 import (
 )
 from sbrdf_jax.layout import (
     read_cleaning,
-    read_compact,
     read_field,
     read_grid,
     write_cleaning,
-    write_compact,
     write_field,
     write_grid,
     write_guided,
     write_validation,
 )
 from sbrdf_jax.metrics import METRIC_AXES, METRIC_UNITS
-from sbrdf_jax.records import CompactBRDF, GriddedBRDF, SpectralField
+from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralField
 from sbrdf_jax.schema import SCHEMA_NAME, SCHEMA_VERSION, open_result
 
 
@@ -54,7 +53,7 @@ class RunResult:
 
     gridded: GriddedBRDF
     field: SpectralField | None = None
-    compact: CompactBRDF | None = None
+    compact: CompactBRDF | LobeTensor | None = None
     metrics: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     clean: CleanReport | None = None
     input: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # JSON values: source, quantity, notes, ...
@@ -155,7 +154,7 @@ def load(path: str | os.PathLike) -> RunResult:
 
 
 @one_line_errors
-def load_stage(path: str | os.PathLike, stage: str) -> GriddedBRDF | CompactBRDF:
+def load_stage(path: str | os.PathLike, stage: str) -> GriddedBRDF | CompactBRDF | LobeTensor:
     """Read what evaluation of one stage needs, "grid" or "compact", and nothing else.
 
     Raises:

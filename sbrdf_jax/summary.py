@@ -12,7 +12,7 @@ import numpy as np
 from sbrdf_jax.folds import LEAVE_ONE_OUT
 from sbrdf_jax.lobes import LOBE_KINDS
 from sbrdf_jax.progress import format_seconds
-from sbrdf_jax.records import STATUS_TEXT, Status
+from sbrdf_jax.records import STATUS_TEXT, CompactBRDF, LobeTensor, Status
 from sbrdf_jax.store import RunResult
 
 ERROR_COLUMNS = (
@@ -117,11 +117,11 @@ def done_table(result: RunResult) -> Table:
         basis = result.field.basis
         rows.append(("spectra", f"{np.shape(basis.synthesis)[0]} coefficients, basis {basis.kind}"))
     if result.compact is not None:
-        compact = result.compact
-        kinds = Counter(LOBE_KINDS[int(kind)] for kind in np.ravel(compact.lobe_kind))
-        lobes = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
-        rows.append(("compact", f"harmonics up to L = {compact.max_degree}; lobes: {lobes}"))
-        rows.append(("lanes", count_statuses(compact.status)))
+        rows.append(("compact", compact_text(result.compact)))
+        found = result.plan.get("represent", {})
+        if "promised" in found:
+            rows.append(("target", f"{found['promised']}; measured: {found['measured']}"))
+        rows.append(("lanes", count_statuses(result.compact.status)))
     ratios = [(name, text) for name, text in RATIOS if name in result.metrics]
     if ratios:
         rows.append(("size", ", ".join(f"{float(result.metrics[name]):.4g}:1 {text}" for name, text in ratios)))
@@ -130,6 +130,17 @@ def done_table(result: RunResult) -> Table:
             share, depth = (float(result.metrics[f"negative_{what}{suffix}"]) for what in ("share", "depth"))
             rows.append((f"{stage} < 0", f"{100 * share:.2g} % of values off the nodes, deepest {-depth:.2g} 1/sr"))
     return Table("What was done", ("", ""), tuple(rows))
+
+
+def compact_text(compact: CompactBRDF | LobeTensor) -> str:
+    """What a compact form is made of."""
+    if isinstance(compact, LobeTensor):
+        *ranks, count = np.shape(compact.core)
+        sizes = " x ".join(map(str, ranks))
+        return f"lobe tensor of ranks {sizes} (theta_i, theta_o, direction), {count} x {compact.basis.kind} spectra"
+    kinds = Counter(LOBE_KINDS[int(kind)] for kind in np.ravel(compact.lobe_kind))
+    lobes = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+    return f"harmonics up to L = {compact.max_degree}; lobes: {lobes}"
 
 
 RATIOS = (

@@ -69,7 +69,7 @@ WRONG_KEYS_AND_VALUES = [
     ("scene: {wavelength_nm: {min: 500}}", "2:24: scene.wavelength_nm: found no 'max'", "[nm]"),
     ("grid: {theta_i_step_deg: 7}", "2:26: grid.theta_i_step_deg: found 7", "did you mean 7.5?"),
     ("grid: {phi_o_step_deg: 7}", "2:24: grid.phi_o_step_deg: found 7", "divides 180"),
-    ("encode: {coefficients: 20}", "2:24: encode.coefficients: found 20", "an odd number"),
+    ("encode: {basis: fourier, coefficients: 20}", "2:40: encode.coefficients: found 20", "an odd number"),
     ("validate: {folds: 1}", "2:19: validate.folds: found 1", "2 or more"),
     (
         "represent:\n  target: {ratio: 9, error: 0.1}",
@@ -92,8 +92,7 @@ WRONG_KEYS_AND_VALUES = [
 
 NOT_BUILT = {
     "input.format": ["rgl-bsdf", "merl", "astm", "pab", "inplane", "alta"],
-    "encode.basis": ["data"],
-    "represent.method": ["lobe_harmonics", "lobe_tensor"],
+    "represent.method": ["lobe_harmonics"],
     "scene": ["{}", "{wavelength_nm: {min: 500, max: 600}}", "{theta_i_deg: [0, 45]}"],
     "runtime.precision": ["float32"],
     "runtime.resume_from": ["old.h5"],
@@ -114,7 +113,11 @@ WRONG_OVERRIDES = [
     ("output.path=", "command line: output.path=: found nothing (null)", "text"),
     ("output.path=[", "command line: output.path=[: found text that is not YAML", "expected YAML"),
     ("grid.x=a\nb", "command line: grid.x=a b: unknown key", ""),
-    ("represent.method=lobe_tensor", "command line: represent.method=lobe_tensor: found 'lobe_te", "not available yet"),
+    (
+        "represent.method=lobe_harmonics",
+        "command line: represent.method=lobe_harmonics: found 'lobe",
+        "not available yet",
+    ),
     (
         "resample={method: paper, smoothness_weight: data}",
         "command line: resample={method",
@@ -287,7 +290,8 @@ def test_a_clash_of_file_and_override_names_what_was_written_last():
 
 def test_autos_of_the_defaults_and_of_paper():
     assert resolve(DEFAULTS).resample == ResampleOptions(method="guided", smoothness_weight="data", tolerance=1e-6)
-    options = resolve(dataclasses.replace(DEFAULTS, resample=ResampleOptions(method="paper")))
+    paper = RepresentOptions(method="paper")
+    options = resolve(dataclasses.replace(DEFAULTS, resample=ResampleOptions(method="paper"), represent=paper))
     assert options.resample == ResampleOptions(method="paper", smoothness_weight=1.0, tolerance=1e-8)
     assert options.encode == EncodeOptions(basis="fourier", coefficients=19)
     assert (options.represent.method, options.represent.max_degree) == ("paper", 4)
@@ -303,7 +307,8 @@ def test_autos_of_other_methods_and_given_values():
     )
     found = resolve(options)
     assert (found.resample.smoothness_weight, found.resample.tolerance) == ("data", 1e-6)
-    assert (found.encode, found.represent.max_degree) == (EncodeOptions(), 8)
+    assert (found.encode, found.represent.max_degree) == (EncodeOptions(basis="data", coefficients=12), 8)
+    assert resolve(DEFAULTS).represent.method == "auto"  # for the data to decide
     options = parse_config(GLASS + "represent: {max_degree: 1}\nresample: {tolerance: 1e-4}\nencode: {basis: cosine}")
     found = resolve(options)
     assert (found.represent.max_degree, found.resample.tolerance) == (1, 1e-4)

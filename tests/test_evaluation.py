@@ -19,8 +19,8 @@ from sbrdf_jax.evaluation import (
     evaluate_in_chunks,
     evaluate_on_axes,
     evaluate_standard_error,
-    spectral_weights,
 )
+from sbrdf_jax.interpolation import spectral_weights
 from sbrdf_jax.representation.paper import compact_coefficient
 from sbrdf_jax.runtime import compile_clock
 

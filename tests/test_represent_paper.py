@@ -10,7 +10,6 @@ from scipy.special import sph_harm_y
 from tolerances import PLANTED, ROUNDING, tolerance
 
 from sbrdf_jax import builtin, encoding
-from sbrdf_jax.errors import UserError
 from sbrdf_jax.harmonics import harmonic_orders, real_harmonics
 from sbrdf_jax.lobes import LOBE_KINDS, lobe_exponents
 from sbrdf_jax.options import RepresentOptions
@@ -266,12 +265,6 @@ def test_evaluation_equals_its_twin_and_has_finite_gradients(rng):
     np.testing.assert_allclose(alone, found, rtol=0, atol=1e-13)
     for where in (compact.lobe_peak_theta_o, np.zeros(4), np.full(4, np.pi / 2)):  # the peak, the pole, the horizon
         assert all(np.isfinite(a).all() for a in slopes(compact, np.arange(4), where, np.full(4, np.pi)))
-
-
-def test_a_method_that_is_not_built_is_refused(rng):
-    field, _ = planted(rng, 1)
-    with pytest.raises(UserError, match="represent.method: found 'lobe_tensor', which is not available yet"):
-        represent(field, RepresentOptions(method="lobe_tensor"))
 
 
 def test_the_two_parts_of_a_field_weigh_as_its_nodes(rng):

@@ -21,6 +21,7 @@ SMALL_GRID = ["grid.theta_i_step_deg=30", "grid.theta_o_step_deg=22.5", "grid.ph
 FAST = [
     *SMALL_GRID,
     "resample.method=paper",
+    "represent.method=paper",
     "represent.max_degree=1",
     "represent.lobe=angle_squared",
     "output.report=false",

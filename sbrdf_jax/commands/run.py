@@ -10,7 +10,7 @@ from sbrdf_jax.cli import SOME_LANES_FAILED, UNEXPECTED
 
 SUMMARY = "From a measurement to a result, as a config says."
 EXAMPLE = """example:
-  sbrdf run configs/quickstart.yaml output.path=results/mine.h5 represent.max_degree=1
+  sbrdf run configs/quickstart.yaml output.path=results/mine.h5 represent.target.error=0.01
 
 key.path=value is read as YAML; a mapping replaces the whole block. --plan only counts the work.
 validate.folds=5 also predicts every sample by a fit that did not see it, and prints the scores.

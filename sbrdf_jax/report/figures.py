@@ -10,7 +10,7 @@ import numpy as np
 from sbrdf_jax.config import parse_config
 from sbrdf_jax.cutoff import CutoffSpectrum, cutoff_warnings, measure_cutoff
 from sbrdf_jax.evaluation import evaluate_in_chunks
-from sbrdf_jax.records import GriddedBRDF, RawSamples, SpectralField
+from sbrdf_jax.records import CompactBRDF, GriddedBRDF, RawSamples, SpectralField
 from sbrdf_jax.report import curves, hemisphere, quality
 from sbrdf_jax.report.fine_grid import finite_wavelengths, interpolate_finely, pick_incidences, ring_effect
 from sbrdf_jax.report.lobe_fits import fit_lobe_kinds
@@ -110,7 +110,7 @@ def _of_interpolation(result: RunResult, samples: RawSamples | None) -> Iterator
             "The ring effect",
             f"Eq. 5 with and without the window, through the same nodes. {numbers}",
         )
-    if result.field is not None and result.compact is not None:
+    if result.field is not None and isinstance(result.compact, CompactBRDF):
         degrees = tuple(dict.fromkeys((1, result.compact.max_degree)))
         fits = fit_lobe_kinds(result.field, grid, fine.incidences[0].index, degrees)
         yield _Sketch(

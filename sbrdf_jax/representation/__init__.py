@@ -2,25 +2,31 @@
 
 from typing import Any
 
-from sbrdf_jax.errors import UserError
 from sbrdf_jax.options import RepresentOptions
-from sbrdf_jax.records import CompactBRDF, SpectralField
-from sbrdf_jax.representation import paper
-
-METHODS = {"paper": paper.represent, "auto": paper.represent}  # auto: the only one that there is
+from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralField
 
 
-def represent(field: SpectralField, options: RepresentOptions) -> CompactBRDF:
+def represent(
+    field: SpectralField, options: RepresentOptions, gridded: GriddedBRDF | None = None
+) -> CompactBRDF | LobeTensor:
     """Return the compact form of a field by the method that the options name.
 
-    Raises:
-        UserError: the method is not available yet.
+    Args:
+        field: Coefficients at the nodes.
+        options: Method, target and limits.
+        gridded: The grid stage, where there is one: other methods than "paper" are then measured
+            against its spectra and fitted between its nodes too.
     """
-    return represent_with_plan(field, options)[0]
+    return represent_with_plan(field, options, gridded)[0]
 
 
-def represent_with_plan(field: SpectralField, options: RepresentOptions) -> tuple[CompactBRDF, dict[str, Any]]:
+def represent_with_plan(
+    field: SpectralField, options: RepresentOptions, gridded: GriddedBRDF | None = None
+) -> tuple[CompactBRDF | LobeTensor, dict[str, Any]]:
     """Return what `represent` does, and what was computed and what was skipped, and why."""
-    if options.method not in METHODS:
-        raise UserError(f"represent.method: found {options.method!r}, which is not available yet, expected 'paper'")
-    return METHODS[options.method](field, options)
+    # here, because evaluation, which `lobe_tensor` uses, imports the values of this package's records
+    from sbrdf_jax.representation import lobe_tensor, paper
+
+    if options.method == "paper":
+        return paper.represent(field, options)
+    return lobe_tensor.represent(field, options, gridded)

@@ -1,0 +1,188 @@
+"""Error against size of the compact forms beside plain ones: python -m benchmarks.compact [--plot PNG] [FILE ...].
+
+Eta of eq. (18) in percent, median and worst over the incident angles with data, of the guided
+field of each measurement (a name like amber_glass is an embedded sample; true:NAME is its truth
+on the paper's grid). Without names: the embedded samples, their truths, and the Cornell files
+of ../shared. Numbers are stored ones for each incident angle of 13, everything counted; a
+number takes 8 bytes.
+"""
+
+import argparse
+import dataclasses
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.compact_baselines import BASELINES
+
+CORNELL = Path(__file__).resolve().parents[2] / "shared" / "data" / "cornell"
+GLASSES = ("amber_glass", "amber_glass_sharp", "amber_glass_broad")
+SIZES = (64, 107, 214, 513)
+ERRORS = (0.045, 0.01)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Print a table for each material; draw all curves."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*")
+    parser.add_argument("--plot", help="write the curves to this picture")
+    parser.add_argument("--paper", action="store_true", help="the paper's method too (half a minute each)")
+    args = parser.parse_args(arguments)
+    from sbrdf_jax.runtime import set_up_jax
+
+    set_up_jax()
+    names = args.names or [f"true:{n}" for n in GLASSES] + list(GLASSES) + sorted(map(str, CORNELL.glob("*.brdf")))
+    curves = {Path(name).stem: measure(name, with_paper=args.paper) for name in names}
+    if args.plot:
+        draw(curves, args.plot)
+
+
+def gridded_field(name: str):
+    """Return the grid stage of a measurement, or the truth of an embedded sample on the paper's grid."""
+    from sbrdf_jax.builtin import true_brdf
+    from sbrdf_jax.config import parse_config, resolve
+    from sbrdf_jax.formats import read
+    from sbrdf_jax.pipeline import prepare
+    from sbrdf_jax.resampling import resample
+
+    truth = name.removeprefix("true:")
+    path = name if Path(name).exists() else f"builtin:{truth}"
+    options = resolve(parse_config(f"input: {{path: '{path}'}}"))
+    ready = prepare(read(options.input.path, options.input), options)
+    gridded = resample(ready.cleaned.samples, ready.grid, options.resample)
+    if truth == name:
+        return gridded
+    mesh = np.meshgrid(gridded.theta_i, gridded.theta_o, gridded.phi_o, indexing="ij")
+    brdf = np.asarray(true_brdf(truth, *mesh, np.asarray(gridded.wavelength_nm)))
+    flags = np.zeros(brdf.shape[:3], int)
+    return dataclasses.replace(gridded, brdf=brdf, extrapolated=flags, field=None, standard_error=None)
+
+
+def measure(name: str, *, with_paper: bool) -> dict[str, list[tuple[float, float, float]]]:
+    """Print the table of one material and return (numbers, median, worst) of each method."""
+    from sbrdf_jax.colour import colour_matching
+    from sbrdf_jax.encoding import data_basis, encode_field, make_basis
+    from sbrdf_jax.metrics import error_at_nodes, error_between, off_node_scores, stored_numbers
+    from sbrdf_jax.options import RepresentOptions, TargetOptions
+    from sbrdf_jax.representation import represent
+
+    gridded = gridded_field(name)
+    wavelength_nm, brdf = np.asarray(gridded.wavelength_nm), np.asarray(gridded.brdf)
+    known = ~np.all(np.asarray(gridded.extrapolated) == 2, axis=(1, 2))
+    matching = colour_matching(wavelength_nm)
+    field = encode_field(gridded, data_basis(wavelength_nm, brdf[known], 12))
+    per_angle = len(known)
+    curves: dict[str, list[tuple[float, float, float]]] = {}
+
+    def report(method, numbers, eta, more=""):
+        at = numbers / per_angle, 100 * np.median(eta[known]), 100 * eta[known].max()
+        curves.setdefault(method, []).append(at)
+        print(f"{method:<20} {at[0]:>8.1f} {8 * at[0]:>8.0f} {at[1]:>9.3f} {at[2]:>9.3f} {more}", flush=True)
+
+    print(f"\n{Path(name).name}: {known.sum()} of {per_angle} incident angles have data")
+    print(f"{'method':<20} {'numbers':>8} {'bytes':>8} {'median %':>9} {'worst %':>9}")
+    targets = [TargetOptions(numbers=size) for size in SIZES] + [TargetOptions(error=error) for error in ERRORS]
+    for target in targets:
+        options = RepresentOptions(method="lobe_tensor", target=target)
+        represent(field, options, gridded)
+        start = time.perf_counter()
+        compact = represent(field, options, gridded)
+        seconds = time.perf_counter() - start
+        at_nodes = error_at_nodes(compact, gridded, matching)
+        between = error_between(compact, gridded)
+        if name.startswith("true:"):
+            between = error_between_truth(compact, gridded, name.removeprefix("true:"))
+        off = [100 * np.nanmedian(value[mask]) for value, mask in (
+            (between["relative_error_between"], known),
+            (between["relative_error_between_theta_i"], known[:-1] & known[1:]),
+        )]  # fmt: skip
+        asked = f"{100 * target.error:g} % everywhere; " if target.error else ""
+        colour = np.median(at_nodes["delta_e_median"][known])
+        share = off_node_scores(compact)[0]
+        more = f"{asked}between {off[0]:.2f}, between theta_i {off[1]:.2f}, Delta E {colour:.2f}, < 0: {share:g}"
+        report("lobe_tensor", stored_numbers(compact), at_nodes["relative_error"], f"{more}, {seconds:.2f} s warm")
+    for method, baseline in BASELINES.items():
+        for size in SIZES:
+            numbers, found = baseline(brdf, known, size * per_angle)
+            if found is not None:
+                error = ((found - brdf) ** 2).sum(axis=(1, 2, 3)) / (brdf**2).sum(axis=(1, 2, 3))
+                report(method, numbers, np.sqrt(error))
+    if with_paper:
+        compact = represent(encode_field(gridded, make_basis(wavelength_nm, "fourier", 19)), RepresentOptions("paper"))
+        report("paper", stored_numbers(compact), error_at_nodes(compact, gridded, matching)["relative_error"])
+    leave_out(gridded, field, known)
+    return curves
+
+
+def error_between_truth(compact, gridded, material: str) -> dict[str, np.ndarray]:
+    """Eq. (18) at the midpoints where the truth is known, as `error_between` names it."""
+    from sbrdf_jax.builtin import true_brdf
+    from sbrdf_jax.metrics import midpoints, on_axes
+
+    def at(theta_i):
+        axes = theta_i, midpoints(gridded.theta_o), midpoints(gridded.phi_o)
+        mesh = np.meshgrid(*axes, indexing="ij")
+        truth = np.asarray(true_brdf(material, *mesh, np.asarray(gridded.wavelength_nm)))[0]
+        return np.linalg.norm(on_axes(compact, *axes) - truth) / np.linalg.norm(truth)
+
+    angles = {"": np.asarray(gridded.theta_i), "_theta_i": midpoints(gridded.theta_i)}
+    return {f"relative_error_between{key}": np.array([at(t) for t in value]) for key, value in angles.items()}
+
+
+def leave_out(gridded, field, known) -> None:
+    """Print the error at every second incident angle, left out: lobe tensor beside interpolations of the grid."""
+    from scipy.interpolate import CubicSpline, PchipInterpolator
+
+    from sbrdf_jax.evaluation import evaluate_on_axes
+    from sbrdf_jax.metrics import on_axes
+    from sbrdf_jax.options import RepresentOptions, TargetOptions
+    from sbrdf_jax.representation import represent
+
+    place = np.flatnonzero(known)
+    kept, left = place[::2], place[1::2]
+    left = left[left < kept[-1]]
+    theta_i, brdf = np.asarray(gridded.theta_i), np.asarray(gridded.brdf)
+    part = dataclasses.replace(
+        gridded, theta_i=theta_i[kept], brdf=brdf[kept], extrapolated=np.asarray(gridded.extrapolated)[kept], field=None
+    )
+    spectra = dataclasses.replace(field, theta_i=theta_i[kept], coefficient=np.asarray(field.coefficient)[kept])
+    options = RepresentOptions(method="lobe_tensor", target=TargetOptions(numbers=214))
+    compact = represent(spectra, options, part)
+    logarithm = np.log(np.maximum(brdf[kept], 1e-9))
+    found = {
+        "lobe_tensor": np.stack([on_axes(compact, t, gridded.theta_o, gridded.phi_o) for t in theta_i[left]]),
+        "windowed sinc": evaluate_on_axes(part, theta_i[left], gridded.theta_o, gridded.phi_o),
+        "PCHIP": PchipInterpolator(theta_i[kept], brdf[kept])(theta_i[left]),
+        "log-cubic": np.exp(CubicSpline(theta_i[kept], logarithm)(theta_i[left])),
+    }
+    print("left out " + " ".join(f"{a:>8.4g}" for a in np.degrees(theta_i[left])))
+    for method, value in found.items():
+        error = ((value - brdf[left]) ** 2).sum(axis=(1, 2, 3)) / (brdf[left] ** 2).sum(axis=(1, 2, 3))
+        print(f"  {method:<14}" + " ".join(f"{100 * e:>8.3f}" for e in np.sqrt(error)), flush=True)
+
+
+def draw(curves, path: str) -> None:
+    """Draw error against bytes, a panel for each material: the worst incident angle solid, the median dotted."""
+    import matplotlib.pyplot as plt
+
+    columns = min(3, len(curves))
+    rows = -(-len(curves) // columns)
+    figure, panels = plt.subplots(rows, columns, figsize=(4 * columns, 3.2 * rows), squeeze=False, sharey=True)
+    for axes, (name, methods) in zip(panels.ravel(), curves.items(), strict=False):
+        for number, (method, points) in enumerate(methods.items()):
+            color = f"C{number}"
+            numbers, median, worst = np.array(sorted(points)).T
+            axes.loglog(8 * numbers, worst, color=color, marker="o", markersize=3, label=method)
+            axes.loglog(8 * numbers, median, color=color, linestyle=":")
+        axes.set_title(name)
+        axes.set_xlabel("bytes for each incident angle")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("relative error [%]")
+    panels[0, 0].legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    main()

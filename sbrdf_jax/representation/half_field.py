@@ -1,0 +1,151 @@
+"""What a lobe tensor is fitted to: a field on one side of the plane of incidence, at its nodes and between them."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.interpolate import PchipInterpolator
+
+from sbrdf_jax.evaluation import evaluate_on_axes
+from sbrdf_jax.records import GriddedBRDF, SpectralField
+
+UNKNOWN_WEIGHT = 0.01  # of an incident angle without data: it does not count, but is not to run wild
+BETWEEN_WEIGHT = 0.03  # of the error between the nodes, beside that at them, where the field is known there
+GUESS_WEIGHT = 1e-3  # where it is interpolated: enough that nothing runs wild
+RELATIVE_SHARE = 0.03  # of the error relative to each direction's own energy
+RELATIVE_FLOOR = 1e-3  # of the mean energy of a direction
+SMALLEST = 1e-9  # of the largest value; logarithms of less are not taken
+TOLERANCE = 1e-6  # of an angle's side of the plane: twins that differ by more are not mirror images
+
+
+class Block(NamedTuple):
+    """Spectra at every combination of three axes."""
+
+    theta_i: Float[np.ndarray, " i"]  # rad
+    theta_o: Float[np.ndarray, " o"]  # rad
+    phi_o: Float[np.ndarray, " p"]  # rad, 0 to pi
+    brdf: Float[np.ndarray, "i o p wavelength"]  # 1/sr
+    weight: Float[np.ndarray, "i o p"]  # of squared errors
+
+
+class HalfField(NamedTuple):
+    """The nodes, then the midpoints of theta_o and phi_o, then, of a field, these midway between incident angles."""
+
+    blocks: tuple[Block, ...]
+    known: Bool[np.ndarray, " theta_i"]  # incident angles that count: finite, not zero throughout, and with data
+    asymmetry: float  # largest relative size of what is odd in phi_o, which is dropped
+
+    @property
+    def nodes(self) -> Block:
+        """The block that eq. (18) is about."""
+        return self.blocks[0]
+
+
+def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"], gridded: GriddedBRDF | None):
+    """Gather what a lobe tensor is fitted to.
+
+    Args:
+        field: The axes.
+        brdf: Spectra at the nodes [1/sr].
+        gridded: The grid stage: which incident angles have data, and what the field is between
+            its nodes where it has a field of its own. Otherwise monotone cubics through logarithms.
+    """
+    theta_i, theta_o, phi_o = (np.asarray(a, np.float64) for a in (field.theta_i, field.theta_o, field.phi_o))
+    count = (len(phi_o) + 1) // 2
+    half, mirrored = brdf[:, :, :count], brdf[:, :, ::-1][:, :, :count]
+    even = (half + mirrored) / 2
+    energy = _energy(even, np.ones(count))
+    usable = np.isfinite(energy) & (energy > 0)
+    known = usable.copy()
+    if gridded is not None:
+        known &= ~np.all(np.asarray(gridded.extrapolated) == 2, axis=(1, 2))
+    if not known.any():
+        known = usable
+    if not usable.any():
+        return HalfField((), known, 0.0)
+    asymmetry = float(np.sqrt((_energy(half - even, np.ones(count))[usable] / energy[usable]).max()))
+    place = np.arange(usable.argmax(), len(usable) - usable[::-1].argmax())  # from the first to the last
+    share = np.where(known, 1.0, np.where(usable, UNKNOWN_WEIGHT, 0.0))[place]
+    weight = np.where(np.arange(count) == count - 1, 1.0, 2.0)  # phi_o = 180 degrees is one node, others have twins
+    nodes = _block(theta_i[place], theta_o, phi_o[:count], even[place], weight, share)
+    mid_o, mid_phi = _midpoints(theta_o), _midpoints(phi_o[:count])
+    twins = np.full(len(mid_phi), 2.0)
+    less = np.minimum(share[:-1], share[1:])
+    if gridded is None or gridded.field is None:
+        between = _interpolate_logarithm(nodes, mid_o, mid_phi)
+        blocks = [nodes, _block(nodes.theta_i, mid_o, mid_phi, between, twins, GUESS_WEIGHT * share)]
+        if field.interpolate_theta_i and len(nodes.theta_i) > 1:
+            phi = np.sort(np.concatenate([nodes.phi_o, mid_phi]))
+            tracked, brdf = _along_mirror_track(nodes, phi)
+            both = np.where(np.arange(len(phi)) == len(phi) - 1, 1.0, 2.0)
+            blocks.append(_block(_midpoints(nodes.theta_i), tracked, phi, brdf, both, GUESS_WEIGHT * less))
+        return HalfField(tuple(blocks), known, asymmetry)
+    finite = np.isin(np.asarray(gridded.field.wavelength_nm), np.asarray(field.basis.wavelength_nm))
+    mid_i = _midpoints(nodes.theta_i) if field.interpolate_theta_i else np.empty(0)
+    both = np.concatenate([nodes.theta_i, mid_i])
+    between = evaluate_on_axes(gridded, both, mid_o, mid_phi)[..., finite]
+    on, midway = np.split(between, [len(nodes.theta_i)])
+    blocks = [nodes, _block(nodes.theta_i, mid_o, mid_phi, on, twins, BETWEEN_WEIGHT * share)]
+    if len(mid_i):
+        blocks.append(_block(mid_i, mid_o, mid_phi, midway, twins, BETWEEN_WEIGHT * less))
+    return HalfField(tuple(blocks), known, asymmetry)
+
+
+def _block(theta_i, theta_o, phi_o, brdf, twins, share) -> Block:
+    """Return a block in which an incident angle weighs `share`, whatever its energy.
+
+    Squares of errors count relative to the energy of the incident angle, as in eq. (18), and to
+    a small part relative to the direction's own: the colour of dark directions rests on that.
+    """
+    energy = _energy(brdf, twins)
+    usable = np.isfinite(energy) & (energy > 0) & (share > 0)
+    clean = np.where(usable[:, None, None, None], brdf, 0.0)
+    energy = np.where(usable, energy, 1.0)[:, None, None]
+    each = (clean**2).sum(axis=-1)
+    number = len(theta_o) * twins.sum()
+    relative = RELATIVE_SHARE / (number * each + RELATIVE_FLOOR * energy)
+    weight = np.where(usable, share, 0.0)[:, None, None] * (1 / energy + relative) * twins
+    return Block(theta_i, theta_o, phi_o, clean, weight)
+
+
+def _energy(brdf, twins):
+    return np.einsum("iopw,iopw,p->i", brdf, brdf, twins)
+
+
+def _midpoints(axis):
+    return (axis[:-1] + axis[1:]) / 2
+
+
+def _logarithm(nodes: Block):
+    return np.log(np.maximum(nodes.brdf, SMALLEST * max(nodes.brdf.max(), 1e-300)))
+
+
+def _interpolate_logarithm(nodes: Block, theta_o, phi_o):
+    """Interpolate nodes by monotone cubics through their logarithms: in theta_o, then in phi_o."""
+    value = PchipInterpolator(nodes.theta_o, _logarithm(nodes), axis=1)(theta_o)
+    return np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))
+
+
+def _along_mirror_track(nodes: Block, phi_o) -> tuple[np.ndarray, np.ndarray]:
+    """Return theta_o and values midway between incident angles: cubics through logarithms of four neighbours.
+
+    theta_o moves with theta_i from neighbour to neighbour, so a peak that moves with its mirror
+    direction stays one peak. Where one of the outer two does not exist, the inner two alone.
+    """
+    step, last, slack = np.diff(nodes.theta_i).mean(), nodes.theta_o[-1], 1e-9
+    first = nodes.theta_o[nodes.theta_o + step <= last + slack]
+    along = PchipInterpolator(nodes.theta_o, _logarithm(nodes), axis=1)
+
+    def neighbour(number):  # of each midway angle, by its place before or behind; nan where there is none
+        theta_o = first + number * step
+        value = along(np.clip(theta_o, 0.0, last))
+        value[:, (theta_o < -slack) | (theta_o > last + slack)] = np.nan
+        place = np.arange(len(nodes.theta_i) - 1) + number
+        outside = (place < 0) | (place >= len(nodes.theta_i))
+        return np.where(outside[:, None, None, None], np.nan, value[np.clip(place, 0, len(nodes.theta_i) - 1)])
+
+    before, below, above, behind = (neighbour(number) for number in (-1, 0, 1, 2))
+    linear = (below + above) / 2
+    cubic = linear + (below + above - before - behind) / 16
+    value = np.where(np.isnan(cubic), linear, cubic)
+    return first + step / 2, np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))

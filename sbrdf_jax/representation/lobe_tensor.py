@@ -1,0 +1,222 @@
+"""The compact form `lobe_tensor`: one Tucker decomposition of a whole field, lobes of all widths in its third factor.
+
+Incident angles are scaled to equal energy; a directional factor of the half angle holds the
+lobe, wherever its peak is, so that the factors of theta_i and theta_o are smooth and few.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sbrdf_jax import colour
+from sbrdf_jax.encoding import decode, spectral_vectors, vector_basis
+from sbrdf_jax.options import RepresentOptions
+from sbrdf_jax.records import GriddedBRDF, LobeTensor, SpectralBasis, SpectralField, Status
+from sbrdf_jax.representation.direction_functions import (
+    direction_functions,
+    half_angle_floor,
+    num_direction_functions,
+)
+from sbrdf_jax.representation.half_field import HalfField, half_field
+from sbrdf_jax.representation.target import Target, is_met, make_target, measured
+from sbrdf_jax.representation.tensor_fit import Factors, Normal, TensorFit
+from sbrdf_jax.representation.tensor_growth import grow
+from sbrdf_jax.splines import spline_weights
+
+MOST_FUNCTIONS = 13  # of one polar angle; the factors are smooth, however fine the grid
+ASYMMETRIC = 0.01  # relative size of the part odd in phi_o from which a user is told that it is dropped
+
+
+class Layout(NamedTuple):
+    """What fixes the size of a tensor, but for its ranks."""
+
+    num_theta_i: int  # nodes of the grid
+    functions: tuple[int, int, int]  # of theta_i, theta_o, direction
+    num_wavelengths: int
+    stores_vectors: bool  # basis "data": its vectors are counted
+
+    def numbers(self, a: int, b: int, q: int, channels: int) -> int:
+        """Count all numbers that the `compact` group holds, its axes included."""
+        n_i, n_o, n_q = self.functions
+        axes = 2 * self.num_theta_i + 2 + self.num_wavelengths + sum(self.functions) + a + b + q + channels
+        vectors = channels * self.num_wavelengths if self.stores_vectors else 0
+        return axes + n_i + n_i * a + n_o * b + n_q * q + a * b * q * channels + vectors
+
+
+def stored_numbers(tensor: LobeTensor) -> int:
+    """Count all numbers that the `compact` group of a result holds, its axes and statuses included."""
+    a, b, q, channels = np.shape(tensor.core)
+    factors = tensor.theta_i_factor, tensor.theta_o_factor, tensor.direction_factor
+    functions = tuple(len(factor) for factor in factors)
+    num_wavelengths, is_data = np.size(tensor.basis.wavelength_nm), tensor.basis.kind == "data"
+    return Layout(np.size(tensor.theta_i), functions, num_wavelengths, is_data).numbers(a, b, q, channels)
+
+
+def represent(
+    field: SpectralField, options: RepresentOptions, gridded: GriddedBRDF | None = None
+) -> tuple[LobeTensor, dict[str, Any]]:
+    """Return the smallest lobe tensor that meets the target, or the best that there is, and what was found.
+
+    Args:
+        field: Coefficients at the nodes; phi_o from 0 to 2 pi inclusive. In basis "data" the
+            vectors are taken in order, as many as pay; of another basis all coefficients are.
+        options: `target` is used.
+        gridded: The grid stage, if there is one: the spectra before encoding, which incident
+            angles have data, and the field between the nodes.
+
+    Returns:
+        The tensor, and a plan: ranks, what was promised and what was measured, `warnings`.
+
+    Numerics:
+        Least squares of the values themselves; the clip at 0 comes last and lowers the error of a
+        field that is nowhere negative. What is odd in phi_o is dropped, with a warning.
+    """
+    theta_i, theta_o = np.asarray(field.theta_i, np.float64), np.asarray(field.theta_o, np.float64)
+    brdf = np.asarray(
+        decode(np.asarray(field.coefficient, np.float64), field.basis) if gridded is None else gridded.brdf
+    )
+    half = half_field(field, brdf, gridded)
+    floor = half_angle_floor(float(np.diff(theta_o).min()))
+    if half.blocks:
+        ends = half.nodes.theta_i[[0, -1]]
+    else:
+        ends = theta_i[[0, -1]]
+    num_rows = len(half.nodes.theta_i) if half.blocks else len(theta_i)
+    num_i = min(num_rows, MOST_FUNCTIONS) if field.interpolate_theta_i else len(theta_i)
+    functions = num_i, min(len(theta_o), MOST_FUNCTIONS), num_direction_functions(floor)
+    num_wavelengths = np.size(field.basis.wavelength_nm)
+    layout = Layout(len(theta_i), functions, num_wavelengths, field.basis.kind == "data")
+    target = make_target(options.target, len(theta_i), num_wavelengths)
+    status = np.where(np.isfinite(brdf).all(axis=(1, 2, 3)), int(Status.SKIPPED), int(Status.NONFINITE))
+    status = np.where(half.known, int(Status.OK), status)
+    basis = field.basis
+    if not half.blocks:  # zero or nothing everywhere
+        factors, log_scale = Factors(*(np.zeros((n, 1)) for n in functions), _no_core(basis)), np.zeros(num_i)
+        achieved = 0.0
+    else:
+        factors, log_scale, basis, achieved = _fit(field, half, layout, target, floor)
+    tensor = LobeTensor(
+        theta_i,
+        ends,
+        basis,
+        log_scale,
+        *factors,
+        status,
+        half_angle_floor=floor,
+        interpolate_theta_i=field.interpolate_theta_i,
+    )
+    return tensor, _plan(tensor, target, achieved, half)
+
+
+def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, floor: float):
+    """Return factors, scales, the basis that they are in, and what was measured of the target."""
+    vectors, to_coefficient = _channels(field.basis, half)
+    place = np.isin(np.asarray(field.theta_i, np.float64), half.nodes.theta_i)
+    rows = np.unique(np.concatenate([block.theta_i for block in half.blocks]))
+    columns = np.unique(np.concatenate([block.theta_o for block in half.blocks]))
+    if field.interpolate_theta_i:
+        low, high = half.nodes.theta_i[[0, -1]]
+        at_rows = spline_weights((rows - low) / (high - low if high > low else 1.0), layout.functions[0], np)
+    else:
+        at_rows = np.eye(layout.functions[0])[place]
+    at_columns = spline_weights(columns * (2 / np.pi), layout.functions[1], np)
+
+    energy = np.einsum("iopw,iopw->i", half.nodes.brdf, half.nodes.brdf)
+    scaled = np.flatnonzero(energy > 0)
+    at_nodes = at_rows[np.searchsorted(rows, half.nodes.theta_i)]
+    log_scale = np.linalg.lstsq(at_nodes[scaled], -0.5 * np.log(energy[scaled]))[0]
+    scale = np.exp(at_rows @ log_scale)
+
+    size, count = layout.functions[2], len(vectors)
+    gram, moment = np.zeros((len(rows), len(columns), size, size)), np.zeros((len(rows), len(columns), size, count))
+    total = 0.0
+    for block in half.blocks:
+        o = np.searchsorted(columns, block.theta_o)
+        for i, angle in enumerate(block.theta_i):
+            row = np.searchsorted(rows, angle)
+            function = _functions(angle, block.theta_o, block.phi_o, floor)
+            weight = (block.weight[i] / scale[row] ** 2)[..., None]
+            weighted = np.swapaxes(function * weight, 1, 2)
+            value = scale[row] * (block.brdf[i] @ vectors.T)
+            gram[row, o] = weighted @ function
+            moment[row, o] = weighted @ value
+            total += float((weight * value**2).sum())
+    fit = TensorFit(Normal(gram, moment, total, at_rows, at_columns))
+
+    nodes, counts = half.nodes, half.known[place]
+    function = np.stack([_functions(angle, nodes.theta_o, nodes.phi_o, floor) for angle in nodes.theta_i])
+    node_rows, node_columns = np.searchsorted(rows, nodes.theta_i), np.searchsorted(columns, nodes.theta_o)
+    matching = None
+    if target.kind == "delta_e":
+        matching = colour.colour_matching(np.asarray(field.basis.wavelength_nm))
+    twins = np.r_[np.full(len(nodes.phi_o) - 1, 2.0), 1.0]
+
+    def measure(factors: Factors) -> float:
+        stored = layout.numbers(*factors.ranks, factors.core.shape[3])
+        if target.kind in ("ratio", "numbers"):
+            return measured(target, stored, nodes.brdf, nodes.brdf, twins, counts, None)
+        amplitude = fit.amplitudes(factors.theta_i, factors.theta_o, factors.core)[np.ix_(node_rows, node_columns)]
+        value = ((function @ factors.direction) @ amplitude) @ vectors[: factors.core.shape[3]]
+        value = np.maximum(value / scale[node_rows][:, None, None, None], 0.0)
+        return measured(target, stored, value, nodes.brdf, twins, counts, matching)
+
+    def is_enough(factors: Factors) -> bool:
+        return target.kind in ("error", "delta_e") and is_met(target, measure(factors))
+
+    first = min(2, count) if layout.stores_vectors else count
+    factors = grow(fit, layout.numbers, target.budget, is_enough, first_channels=first)
+    achieved, used = measure(factors), factors.core.shape[3]
+    basis = vector_basis(field.basis.wavelength_nm, vectors[:used]) if layout.stores_vectors else field.basis
+    return factors._replace(core=factors.core @ to_coefficient[:used, :used]), log_scale, basis, achieved
+
+
+def _functions(theta_i, theta_o, phi_o, floor) -> Float[np.ndarray, "o p function"]:
+    """Return the directional functions of one incident angle at every combination of two axes."""
+    mesh = np.meshgrid(theta_o, phi_o, indexing="ij")
+    return direction_functions(np.full(mesh[0].shape, theta_i), *mesh, floor, np)
+
+
+def _channels(basis: SpectralBasis, half: HalfField) -> tuple[np.ndarray, np.ndarray]:
+    """Return orthonormal spectra [channel, wavelength], and the matrix from channels to coefficients.
+
+    For "data" the vectors are found anew, between the nodes too: there may be peaks there.
+    """
+    synthesis = np.asarray(basis.synthesis, np.float64)
+    if basis.kind == "data":
+        rows = [(np.sqrt(b.weight)[..., None] * b.brdf).reshape(-1, synthesis.shape[1]) for b in half.blocks]
+        return spectral_vectors(np.concatenate(rows))[: len(synthesis)], np.eye(len(synthesis))
+    columns, triangle = np.linalg.qr(synthesis.T)
+    return columns.T, np.linalg.inv(triangle).T
+
+
+def _no_core(basis: SpectralBasis) -> np.ndarray:
+    return np.zeros((1, 1, 1, np.shape(basis.synthesis)[0]))
+
+
+def _plan(tensor: LobeTensor, target: Target, achieved: float, half: HalfField) -> dict[str, Any]:
+    """Say what was promised and what was measured."""
+    met = is_met(target, achieved)
+    warnings = []
+    if not met:
+        warnings.append(f"compact: the target, {target.text}, is not met: {_in_words(target, achieved)} is the best")
+    if half.asymmetry > ASYMMETRIC:
+        share = f"{100 * half.asymmetry:.2g} %"
+        warnings.append(f"compact: {share} of the field is not symmetric to the plane of incidence and was dropped")
+    return {
+        "method": "lobe_tensor",
+        "ranks": np.array(np.shape(tensor.core)),
+        "promised": target.text,
+        "measured": _in_words(target, achieved),
+        "is_met": int(met),
+        "warnings": warnings,
+    }
+
+
+def _in_words(target: Target, value: float) -> str:
+    return {
+        "ratio": f"{value:.4g}:1",
+        "numbers": f"{value:.4g} numbers for each incident angle",
+        "error": f"{100 * value:.3g} % at the worst",
+        "delta_e": f"{value:.3g} at the worst",
+    }[target.kind]

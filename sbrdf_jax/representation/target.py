@@ -1,0 +1,82 @@
+"""What a compact form has to meet: a budget of numbers, or an error at every incident angle that counts."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from sbrdf_jax import colour
+from sbrdf_jax.options import TargetOptions
+
+PAPER_DIRECTIONS = 13 * 49  # the paper's nodes of one incident angle, copies at the pole and at 360 degrees counted
+
+
+class Target(NamedTuple):
+    """One promise. `kind` is a key of `represent.target`."""
+
+    kind: str
+    value: float
+    budget: float  # most stored numbers, over all incident angles
+
+    @property
+    def text(self) -> str:
+        """The promise in words."""
+        return {
+            "ratio": f"compression ratio of at least {self.value:g}",
+            "numbers": f"at most {self.value:g} numbers for each incident angle",
+            "error": f"relative error of at most {100 * self.value:.3g} % at every incident angle with data",
+            "delta_e": f"median Delta E 2000 of at most {self.value:g} at every incident angle with data",
+        }[self.kind]
+
+
+def make_target(options: TargetOptions, num_theta_i: int, num_wavelengths: int) -> Target:
+    """Return the target that the options give, for a grid."""
+    kind, value = next((name, value) for name, value in vars(options).items() if value is not None)
+    budget = {
+        "ratio": num_theta_i * PAPER_DIRECTIONS * num_wavelengths / value,
+        "numbers": num_theta_i * value,
+    }.get(kind, float("inf"))
+    return Target(kind, float(value), float(budget))
+
+
+def node_errors(
+    found: Float[np.ndarray, "i o p wavelength"], wanted: Float[np.ndarray, "i o p wavelength"], twins
+) -> Float[np.ndarray, " i"]:
+    """Eq. (18) for each incident angle; `twins` [p]: how many nodes each azimuth stands for."""
+    error = np.einsum("iopw,p->i", (found - wanted) ** 2, twins)
+    energy = np.einsum("iopw,p->i", wanted**2, twins)
+    return np.sqrt(error / np.where(energy > 0, energy, 1.0))
+
+
+def median_delta_e(
+    found: Float[np.ndarray, "i o p wavelength"],
+    wanted: Float[np.ndarray, "i o p wavelength"],
+    matching: colour.ColourMatching,
+) -> Float[np.ndarray, " i"]:
+    """Median colour difference under D65 over the nodes of each incident angle, from those on one side."""
+    difference = colour.delta_e_2000(found, wanted, matching)
+    difference = np.concatenate([difference, difference[:, :, -2::-1]], axis=2)
+    return np.median(difference.reshape(len(difference), -1), axis=1)
+
+
+def measured(
+    target: Target,
+    stored: int,
+    found: Float[np.ndarray, "i o p wavelength"],
+    wanted: Float[np.ndarray, "i o p wavelength"],
+    twins: Float[np.ndarray, " p"],
+    known: Bool[np.ndarray, " i"],
+    matching: colour.ColourMatching | None,
+) -> float:
+    """Return what stands beside the promise: the ratio, the numbers, or the worst incident angle's error."""
+    if target.kind in ("ratio", "numbers"):
+        return target.value * (target.budget / stored if target.kind == "ratio" else stored / target.budget)
+    if target.kind == "error":
+        return float(node_errors(found, wanted, twins)[known].max(initial=0.0))
+    assert matching is not None
+    return float(median_delta_e(found, wanted, matching)[known].max(initial=0.0))
+
+
+def is_met(target: Target, value: float) -> bool:
+    """True where a measured value keeps the promise."""
+    return value >= target.value if target.kind == "ratio" else value <= target.value

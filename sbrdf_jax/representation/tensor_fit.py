@@ -1,0 +1,186 @@
+"""Alternating least squares of a Tucker decomposition whose third factor is a function of both directions.
+
+    value[i, o, p, c] = sum of u[i, a] v[o, b] w[i, o, p, q] core[a, b, q, c],
+
+u and v splines of theta_i and theta_o, w a combination of functions of a pair of directions
+(so no index of the grid). Azimuths enter by two sums for each (i, o) only, which makes a step
+independent of how many there are. NumPy in float64 on the host: ranks change from step to step,
+and each would compile anew.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+
+RIDGE = 1e-5  # relative to the diagonal: what no value shows stays small, and directions between run not wild
+
+
+class Factors(NamedTuple):
+    """Coefficients of the factors' functions, and the core."""
+
+    theta_i: Float[np.ndarray, "theta_i_function a"]
+    theta_o: Float[np.ndarray, "theta_o_function b"]
+    direction: Float[np.ndarray, "direction_function q"]
+    core: Float[np.ndarray, "a b q channel"]
+
+    @property
+    def ranks(self) -> tuple[int, int, int]:
+        """Ranks a, b, q."""
+        a, b, q, _ = self.core.shape
+        return a, b, q
+
+
+class Normal(NamedTuple):
+    """What least squares needs to know of the values, for every pair (i, o) of polar angles."""
+
+    gram: Float[np.ndarray, "i o direction_function direction_function"]
+    moment: Float[np.ndarray, "i o direction_function channel"]
+    energy: float  # weighted sum of squares of the values
+    theta_i: Float[np.ndarray, "i theta_i_function"]  # the functions of theta_i at its rows
+    theta_o: Float[np.ndarray, "o theta_o_function"]
+
+
+class Projection(NamedTuple):
+    """Sums over azimuths for a directional factor, for every pair (i, o)."""
+
+    gram: Float[np.ndarray, "i o qq"]
+    moment: Float[np.ndarray, "i o q channel"]
+
+
+class TensorFit:
+    """The problem, and its partial solutions: each of the four parts, the others held fixed."""
+
+    def __init__(self, normal: Normal):
+        self.normal = normal
+        total = normal.gram.sum(axis=(0, 1))
+        size = len(total)
+        shift = RIDGE * np.trace(total) / size * np.eye(size)
+        self.roots = (
+            np.linalg.qr(normal.theta_i)[1],
+            np.linalg.qr(normal.theta_o)[1],
+            np.linalg.cholesky(total + shift).T,
+        )
+
+    def orthonormal(self, mode: int, factor):
+        """Make the columns of a factor orthonormal over the rows of its mode, as far as they are independent."""
+        return factor @ np.linalg.pinv(np.linalg.qr(self.roots[mode] @ factor)[1], rcond=1e-10)
+
+    def start(self) -> list[np.ndarray]:
+        """Return factors of rank 2: constant and linear in both polar angles, the leading lobes in direction."""
+        n = self.normal
+        moment = n.moment.transpose(2, 0, 1, 3).reshape(n.moment.shape[2], -1)
+        scaled = scipy.linalg.solve_triangular(self.roots[2], moment, trans="T")
+        lobes = scipy.linalg.solve_triangular(self.roots[2], np.linalg.eigh(scaled @ scaled.T)[1][:, :-3:-1])
+        lines = (np.vander(np.linspace(-1, 1, f.shape[1]), 2)[:, : f.shape[1]] for f in (n.theta_i, n.theta_o))
+        return [self.orthonormal(mode, factor) for mode, factor in enumerate((*lines, lobes))]
+
+    def project(self, w) -> Projection:
+        """Return what the directional factor makes of Gram matrices and moments."""
+        gram = w.T @ self.normal.gram @ w
+        return Projection(gram.reshape(*gram.shape[:2], -1), w.T @ self.normal.moment)
+
+    def solve_core(self, u, v, projection: Projection) -> tuple[np.ndarray, np.ndarray]:
+        """Return the core, and by how much each channel lowers the error."""
+        gram, moment = projection
+        at_i, at_o = self.normal.theta_i @ u, self.normal.theta_o @ v
+        a, b, q, c = u.shape[1], v.shape[1], moment.shape[2], moment.shape[3]
+        matrix = np.tensordot(np.tensordot(_pairs(at_i), gram, (0, 0)), _pairs(at_o), (1, 0))  # [aa, qq, bb]
+        matrix = matrix.reshape(a, a, q, q, b, b).transpose(0, 4, 2, 1, 5, 3).reshape(a * b * q, -1)
+        right = np.tensordot(np.tensordot(at_i, moment, (0, 0)), at_o, (1, 0))  # [a, q, c, b]
+        right = right.transpose(0, 3, 1, 2).reshape(a * b * q, c)
+        core = _solve(matrix, right)
+        gain = 2 * (core * right).sum(axis=0) - (core * (matrix @ core)).sum(axis=0)
+        return core.reshape(a, b, q, c), gain
+
+    def sweep(self, factors, channels: int) -> list[np.ndarray]:
+        """Renew each factor once, by the first `channels` alone."""
+        u, v, w = factors
+        n, projection = self.normal, self.project(w)
+        for mode in range(3):
+            core = self.solve_core(u, v, projection)[0][..., :channels]
+            gram, moment = projection.gram, projection.moment[..., :channels]
+            a, b, q, c = core.shape
+            if mode == 0:
+                part = np.tensordot(n.theta_o @ v, core, (1, 1)).transpose(0, 2, 3, 1)  # [o, q, c, a]
+                squares = _channel_pairs(part).reshape(-1, a * a)
+                matrix = gram.reshape(len(gram), -1) @ squares
+                right = moment.reshape(len(moment), -1) @ part.reshape(-1, a)
+                u = self.orthonormal(0, _solve_mode(n.theta_i, matrix, right))
+            elif mode == 1:
+                part = np.tensordot(n.theta_i @ u, core, (1, 0)).transpose(0, 2, 3, 1)  # [i, q, c, b]
+                squares = _channel_pairs(part).reshape(-1, b * b)
+                matrix = np.swapaxes(gram, 0, 1).reshape(gram.shape[1], -1) @ squares
+                right = np.swapaxes(moment, 0, 1).reshape(moment.shape[1], -1) @ part.reshape(-1, b)
+                v = self.orthonormal(1, _solve_mode(n.theta_o, matrix, right))
+            else:
+                part = self.amplitudes(u, v, core)  # [i, o, q, c]
+                squares = (part @ np.swapaxes(part, 2, 3)).reshape(-1, q * q)
+                size = n.gram.shape[-1]
+                matrix = _unpair(n.gram.reshape(-1, size * size).T @ squares, size, q)
+                right = np.tensordot(n.moment[..., :channels], part, ((0, 1, 3), (0, 1, 3)))
+                w = self.orthonormal(2, _solve(matrix, right.reshape(-1, 1)).reshape(size, q))
+        return [u, v, w]
+
+    def amplitudes(self, u, v, core) -> Float[np.ndarray, "i o q channel"]:
+        """Return what multiplies the directional factor at every pair of polar angles."""
+        at_i, at_o = self.normal.theta_i @ u, self.normal.theta_o @ v
+        return np.tensordot(np.tensordot(at_i, core, (1, 0)), at_o, (1, 1)).transpose(0, 3, 1, 2)
+
+    def widened(self, factors, core) -> list[np.ndarray | None]:
+        """Return each factor with one more column, the leading one of the residual; None at its limit."""
+        u, v, w = factors
+        n, channels = self.normal, core.shape[3]
+        rest = n.moment[..., :channels] - n.gram @ (w @ self.amplitudes(u, v, core))
+        at_i, at_o, along = n.theta_i @ u, n.theta_o @ v, w.T @ rest
+        steepest = (
+            n.theta_i.T @ np.tensordot(along, at_o, (1, 0)).reshape(len(at_i), -1),
+            n.theta_o.T @ np.tensordot(along, at_i, (0, 0)).reshape(len(at_o), -1),
+            np.tensordot(np.tensordot(rest, at_i, (0, 0)), at_o, (0, 0)).reshape(len(w), -1),
+        )
+        found: list[np.ndarray | None] = []
+        for mode, (matrix, root) in enumerate(zip(steepest, self.roots, strict=True)):
+            others = [f.shape[1] for k, f in enumerate(factors) if k != mode]
+            rank = factors[mode].shape[1] + 1
+            if rank > len(matrix) or rank > others[0] * others[1] * channels:
+                found.append(None)
+                continue
+            scaled = scipy.linalg.solve_triangular(root, matrix, trans="T")
+            leading = np.linalg.eigh(scaled @ scaled.T)[1][:, -1:]
+            column = scipy.linalg.solve_triangular(root, leading)
+            found.append(self.orthonormal(mode, np.concatenate([factors[mode], column], axis=1)))
+        return found
+
+
+def _pairs(x):
+    """Return all products of two columns, [row, column * column]."""
+    return (x[:, :, None] * x[:, None, :]).reshape(len(x), -1)
+
+
+def _channel_pairs(part):
+    """Return sum over channels of all products: [x, q, c, a] to [x, q q, a a]."""
+    x, q, c, a = part.shape
+    rows = part.transpose(0, 1, 3, 2).reshape(x, q * a, c)
+    return (rows @ np.swapaxes(rows, 1, 2)).reshape(x, q, a, q, a).transpose(0, 1, 3, 2, 4).reshape(x * q * q, a * a)
+
+
+def _unpair(matrix, m, n):
+    """Return [m m, n n] as the square matrix [m n, m n]."""
+    return matrix.reshape(m, m, n, n).transpose(0, 2, 1, 3).reshape(m * n, m * n)
+
+
+def _solve_mode(functions, matrix, right):
+    """Solve for the coefficients of a factor's functions, from normal equations [row, rank rank] of its rows."""
+    size, rank = functions.shape[1], right.shape[1]
+    whole = _unpair(_pairs(functions).T @ matrix, size, rank)
+    return _solve(whole, (functions.T @ right).reshape(-1, 1)).reshape(size, rank)
+
+
+def _solve(matrix, right):
+    """Solve normal equations after scaling their diagonal to 1, with a small ridge."""
+    diagonal = np.diag(matrix)
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scaled = matrix * scale[:, None] * scale + RIDGE * np.eye(len(matrix))
+    factor = scipy.linalg.cho_factor(scaled, overwrite_a=True, check_finite=False)
+    return scale[:, None] * scipy.linalg.cho_solve(factor, scale[:, None] * right, check_finite=False)

@@ -1,0 +1,288 @@
+"""The lobe tensor: least squares against plain ones, planted fields, sharp lobes, targets, hard input."""
+
+import dataclasses
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.interpolate import BSpline
+from tolerances import GRADIENT, ROUNDING, tolerance
+
+from sbrdf_jax import builtin, store
+from sbrdf_jax.colour import colour_matching
+from sbrdf_jax.encoding import coefficients_allowed, data_basis, decode, encode, encode_field, make_basis
+from sbrdf_jax.evaluation import evaluate, evaluate_in_chunks
+from sbrdf_jax.metrics import compression, error_at_nodes, error_between, on_axes, stored_numbers
+from sbrdf_jax.options import RepresentOptions, TargetOptions
+from sbrdf_jax.records import GriddedBRDF, SpectralField, Status
+from sbrdf_jax.representation import represent, represent_with_plan
+from sbrdf_jax.representation.direction_functions import direction_functions, num_direction_functions
+from sbrdf_jax.representation.tensor_fit import Normal, TensorFit
+from sbrdf_jax.splines import spline_weights
+
+ROUND = tolerance(ROUNDING, np.float64)
+THETA = np.radians(np.arange(0, 90.1, 15))
+PHI = np.radians(np.arange(0, 360.1, 15))
+WAVELENGTH_NM = np.linspace(400.0, 700.0, 9)
+NUMBERS = RepresentOptions(method="lobe_tensor", target=TargetOptions(numbers=120))
+
+
+def truth(name, theta_i, theta_o, phi_o):
+    mesh = np.meshgrid(theta_i, theta_o, phi_o, indexing="ij")
+    return np.asarray(builtin.true_brdf(name, *mesh, WAVELENGTH_NM))
+
+
+def grid_of(brdf, *, theta_i=THETA, extrapolated=None, interpolate_theta_i=True) -> GriddedBRDF:
+    lanes = np.zeros(len(WAVELENGTH_NM))
+    flags = np.zeros(brdf.shape[:3], int) if extrapolated is None else extrapolated
+    return GriddedBRDF(
+        theta_i, THETA, PHI, WAVELENGTH_NM, brdf, flags, lanes, lanes, lanes, interpolate_theta_i=interpolate_theta_i
+    )
+
+
+def field_of(gridded, count=4) -> SpectralField:
+    return encode_field(gridded, data_basis(WAVELENGTH_NM, np.asarray(gridded.brdf), count))
+
+
+def eta(found, gridded):
+    """Eq. (18) for each incident angle."""
+    value = np.stack([on_axes(found, t, THETA, PHI) for t in np.asarray(gridded.theta_i)])
+    axes = (1, 2, 3)
+    return np.sqrt(((value - gridded.brdf) ** 2).sum(axes) / (np.asarray(gridded.brdf) ** 2).sum(axes))
+
+
+@pytest.fixture(scope="module")
+def amber():
+    """The true amber glass on a coarse grid, and its lobe tensor."""
+    gridded = grid_of(truth("amber_glass", THETA, THETA, PHI))
+    field = field_of(gridded)
+    return gridded, field, represent(field, NUMBERS, gridded)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 13])
+def test_splines_are_those_of_scipy(count, rng):
+    position = np.concatenate([[0.0, 1.0], rng.uniform(size=20)])
+    degree = min(3, count - 1)
+    knots = np.concatenate([np.zeros(degree), np.linspace(0, 1, count - degree + 1), np.ones(degree)])
+    expected = BSpline.design_matrix(position, knots, degree).toarray()
+    np.testing.assert_allclose(spline_weights(position, count, np), expected, rtol=0, atol=ROUND)
+    np.testing.assert_allclose(spline_weights(jnp.asarray(position), count, jnp), expected, rtol=0, atol=ROUND)
+    beyond = spline_weights(np.array([-0.5, 1.5]), count, np)
+    np.testing.assert_allclose(beyond, spline_weights(np.array([0.0, 1.0]), count, np), rtol=0, atol=0)
+
+
+def test_direction_functions_know_no_azimuth_at_the_poles_and_are_finite_at_grazing(rng):
+    floor = 1e-4
+    phi = rng.uniform(0, 6, 5)
+    zero, other = np.zeros(5), np.full(5, 0.7)
+    for theta_i, theta_o in ((zero, other), (other, zero)):
+        found = direction_functions(theta_i, theta_o, phi, floor, np)
+        assert found.shape == (5, num_direction_functions(floor))
+        assert np.abs(found - found[:1]).max() < ROUND
+    grazing, mirror = np.full(1, np.pi / 2), np.full(1, np.pi)
+    found = direction_functions(grazing, grazing, mirror, floor, np)
+    expected = direction_functions(np.full(1, 0.3), np.full(1, 0.3), mirror, floor, np)  # half angle 0 alike
+    assert np.abs(found - expected)[0, :-3].max() < ROUND
+
+
+def test_each_step_is_plain_least_squares(rng):
+    num_i, num_o, num_phi, size, channels = 5, 6, 7, 4, 2
+    at_i, at_o = rng.normal(size=(num_i, 4)), rng.normal(size=(num_o, 5))
+    function = rng.normal(size=(num_i, num_o, num_phi, size))
+    value, weight = rng.normal(size=(num_i, num_o, num_phi, channels)), rng.uniform(0.5, 2, (num_i, num_o, num_phi))
+    gram = np.einsum("iop,iopk,iopl->iokl", weight, function, function)
+    moment = np.einsum("iop,iopk,iopc->iokc", weight, function, value)
+    energy = (weight[..., None] * value**2).sum()
+    fit = TensorFit(Normal(gram, moment, energy, at_i, at_o))
+    u, v, w = (rng.normal(size=(n, 2)) for n in (4, 5, size))
+
+    def model(u, v, w, core):
+        return np.einsum("ia,ob,iopq,abqc->iopc", at_i @ u, at_o @ v, function @ w, core)
+
+    def plain(make, shape):
+        """Least squares by the explicit matrix of a linear function."""
+        units = np.eye(int(np.prod(shape))).reshape(-1, *shape)
+        root = np.sqrt(weight)[..., None]
+        matrix = np.stack([(root * make(unit)).ravel() for unit in units], axis=1)
+        return np.linalg.lstsq(matrix, (root * value).ravel())[0].reshape(shape)
+
+    core, gain = fit.solve_core(u, v, fit.project(w))
+    expected = plain(lambda c: model(u, v, w, c), core.shape)
+    loose = 1e-2  # a ridge of 1e-5 of the diagonal
+    np.testing.assert_allclose(core, expected, rtol=0, atol=loose)
+    left = (weight[..., None] * (value - model(u, v, w, core)) ** 2).sum()
+    assert abs(energy - gain.sum() - left) < loose * energy
+
+    once = fit.sweep([u, v, w], channels)
+    by_hand = [u, v, w]
+    for mode in range(3):
+        core = fit.solve_core(*by_hand[:2], fit.project(by_hand[2]))[0]
+
+        def with_factor(factor, mode=mode, core=core):
+            return model(*[factor if k == mode else f for k, f in enumerate(by_hand)], core)
+
+        by_hand[mode] = fit.orthonormal(mode, plain(with_factor, by_hand[mode].shape))
+    for found, wanted in zip(once, by_hand, strict=True):
+        np.testing.assert_allclose(found @ np.linalg.pinv(found), wanted @ np.linalg.pinv(wanted), rtol=0, atol=loose)
+
+
+def test_a_sharp_lobe_costs_few_numbers_at_the_nodes_and_between_them(amber):
+    gridded, _, found = amber
+    assert stored_numbers(found) / len(THETA) <= 120
+    assert eta(found, gridded)[:-1].max() < 0.02
+    theta_i, theta_o, phi_o = np.radians([20.0, 40.0, 50.0]), np.radians([10.0, 37.0, 52.0]), np.radians([5.0, 175.0])
+    expected = truth("amber_glass", theta_i, theta_o, phi_o)
+    mesh = np.meshgrid(theta_i, theta_o, phi_o, indexing="ij")
+    error = np.linalg.norm(evaluate_in_chunks(found, *mesh) - expected) / np.linalg.norm(expected)
+    assert error < 0.15  # on a grid of 15 degrees, between which the field is guessed
+
+
+def test_never_negative_and_finite_with_gradients_everywhere(amber, rng):
+    found = amber[2]
+    edges = np.array([0.0, np.pi / 2])
+    angles = [np.concatenate([rng.uniform(0, np.pi / 2, 3000), np.repeat(edges, 2)]) for _ in range(2)]
+    phi = np.concatenate([rng.uniform(-7, 7, 3000), np.tile([0.0, np.pi], 2)])
+    value = evaluate_in_chunks(found, *angles, phi)
+    assert np.isfinite(value).all() and (value >= 0).all()
+    slope = jax.jit(jax.vmap(jax.grad(lambda a: evaluate(found, a[0], a[1], a[2]).sum())))
+    at = jnp.asarray(np.stack([*angles, phi], axis=1)[-40:])
+    assert np.isfinite(slope(at)).all()
+    step = 1e-6
+    for axis in range(3):
+        shift = step * jnp.eye(3)[axis]
+        ahead, behind = (jax.vmap(lambda a: evaluate(found, *a).sum())(at[:20] + s * shift[None]) for s in (1, -1))
+        numeric = np.asarray(ahead - behind) / (2 * step)
+        error = np.abs(numeric - np.asarray(slope(at[:20]))[:, axis]).max() / (np.abs(numeric).max() + 1)
+        assert error < 1e2 * tolerance(GRADIENT, np.float64)  # a clip at 0 or a sharp lobe within the step
+
+
+def test_the_group_alone_evaluates_to_the_same_numbers(amber, tmp_path, rng):
+    gridded, field, found = amber
+    store.save(tmp_path / "r.h5", store.RunResult(gridded=gridded, field=field, compact=found))
+    again = store.load(tmp_path / "r.h5")
+    with h5py.File(tmp_path / "r.h5") as whole, h5py.File(tmp_path / "part.h5", "w") as part:
+        part.attrs["schema_name"], part.attrs["schema_version"] = "sbrdf-result", 1
+        whole.copy("compact", part)
+        sizes: list[int] = []
+        part["compact"].visititems(lambda _, item: sizes.append(item.size))
+        assert part["compact"].attrs["method"] == "lobe_tensor"
+        assert sum(sizes) == part["compact"].attrs["stored_numbers"] == stored_numbers(found)
+    alone = store.load_stage(tmp_path / "part.h5", "compact")
+    angles = rng.uniform(0, 1.5, (3, 50))
+    wavelength = np.array([400.0, 512.3])
+    expected = evaluate_in_chunks(found, *angles, wavelength)
+    for loaded in (alone, again.compact):
+        np.testing.assert_allclose(evaluate_in_chunks(loaded, *angles, wavelength), expected, rtol=1e-9, atol=1e-12)
+    assert again.field is not None
+    np.testing.assert_array_equal(again.field.basis.synthesis, field.basis.synthesis)
+
+
+@pytest.mark.parametrize("target", [{"error": 0.03}, {"delta_e": 2.0}, {"ratio": 40.0}, {"numbers": 60}], ids=str)
+def test_targets_are_met_and_the_plan_says_so(amber, target):
+    gridded, field, _ = amber
+    known = grid_of(gridded.brdf, extrapolated=np.repeat([0] * 6 + [2], 7 * 25).reshape(7, 7, 25))
+    found, plan = represent_with_plan(field, RepresentOptions(target=TargetOptions(**target)), known)
+    assert plan["is_met"] and not plan["warnings"] and plan["promised"]
+    if "error" in target:
+        assert eta(found, gridded)[:-1].max() <= 0.03
+    elif "delta_e" in target:
+        assert error_at_nodes(found, gridded, colour_matching(WAVELENGTH_NM))["delta_e_median"][:-1].max() <= 2.0
+    elif "ratio" in target:
+        assert compression(found)["compression_ratio"] >= 40
+    elif "numbers" in target:
+        assert stored_numbers(found) <= 60 * len(THETA)
+    np.testing.assert_array_equal(found.status, [Status.OK] * 6 + [Status.SKIPPED])
+
+
+@pytest.mark.parametrize("target", [{"error": 1e-9}, {"numbers": 5}], ids=str)
+def test_what_cannot_be_met_is_the_best_and_a_warning(amber, target):
+    gridded, field, _ = amber
+    found, plan = represent_with_plan(field, RepresentOptions(target=TargetOptions(**target)), gridded)
+    assert not plan["is_met"] and "is not met" in plan["warnings"][0]
+    assert np.isfinite(eta(found, gridded)).all()
+
+
+@pytest.mark.parametrize("kind", ["cosine", "fourier", "identity"])
+def test_other_spectral_bases(amber, kind):
+    gridded, _, _ = amber
+    field = encode_field(gridded, make_basis(WAVELENGTH_NM, kind, 7))
+    found = represent(field, NUMBERS, gridded)
+    assert found.basis.kind == kind
+    limit = eta_of_truncation(gridded.brdf, field.basis)
+    assert (eta(found, gridded)[:-1] < limit[:-1] + 0.05).all()
+
+
+def eta_of_truncation(brdf, basis):
+    rest = brdf - brdf @ np.linalg.pinv(basis.synthesis) @ basis.synthesis
+    return np.sqrt((rest**2).sum((1, 2, 3)) / (brdf**2).sum((1, 2, 3)))
+
+
+def test_zero_nonfinite_and_lopsided_fields(amber):
+    gridded, _, _ = amber
+    dark = grid_of(np.zeros_like(gridded.brdf))
+    found = represent(encode_field(dark, make_basis(WAVELENGTH_NM, "identity", 9)), NUMBERS, dark)
+    assert (evaluate_in_chunks(found, np.array(0.3), THETA, np.array(1.0)) == 0).all()
+
+    brdf = np.array(gridded.brdf)
+    brdf[2, 3, 4] = np.nan
+    found = represent(field_of(gridded), NUMBERS, grid_of(brdf))
+    assert found.status[2] == Status.NONFINITE and (np.delete(found.status, 2) == Status.OK).all()
+    assert np.isfinite(eta(found, gridded)).all()
+
+    brdf[1:] = np.nan
+    found = represent(field_of(gridded), NUMBERS, grid_of(brdf))  # one incident angle is left
+    assert eta(found, gridded)[0] < 0.02 and np.isfinite(evaluate_in_chunks(found, THETA, THETA, THETA)).all()
+
+    lopsided = grid_of(gridded.brdf * (1 + 0.3 * np.sin(PHI)[:, None]))
+    _, plan = represent_with_plan(field_of(lopsided), NUMBERS, lopsided)
+    assert "not symmetric" in plan["warnings"][0]
+
+
+@pytest.mark.parametrize("power", [1e-6, 1e6])
+def test_units_do_not_matter(amber, power, rng):
+    gridded, _, found = amber
+    scaled = grid_of(gridded.brdf * power)
+    again = represent(field_of(scaled), NUMBERS, scaled)
+    angles = rng.uniform(0, 1.5, (3, 50))
+    expected = power * evaluate_in_chunks(found, *angles)
+    loose = 1e-3  # in directions that no node shows the ridge decides, at the level of rounding
+    np.testing.assert_allclose(evaluate_in_chunks(again, *angles), expected, rtol=0, atol=loose * expected.max())
+
+
+def test_fewer_than_three_incident_angles_are_not_interpolated():
+    theta_i = np.radians([20.0, 55.0])
+    gridded = grid_of(truth("amber_glass", theta_i, THETA, PHI), theta_i=theta_i, interpolate_theta_i=False)
+    found = represent(field_of(gridded), NUMBERS, gridded)
+    assert eta(found, gridded).max() < 0.1  # 240 numbers in all
+    zero = np.zeros(2)
+    beside = evaluate_in_chunks(found, theta_i + np.array([0.1, 0.3]), zero, zero)  # of the nearest node's factors
+    assert found.theta_i_factor.shape[0] == 2 and np.isfinite(beside).all() and (beside >= 0).all()
+
+
+def test_one_wavelength_and_one_step_finer(amber):
+    gridded, _, _ = amber
+    one = dataclasses.replace(gridded, brdf=gridded.brdf[..., 3:4], wavelength_nm=WAVELENGTH_NM[3:4])
+    found = represent(encode_field(one, make_basis(WAVELENGTH_NM[3:4], "identity", 1)), NUMBERS, one)
+    assert eta(found, one)[:-1].max() < 0.02
+
+
+def test_between_errors_are_those_of_nodes_in_size(amber):
+    gridded, _, found = amber
+    between = error_between(found, dataclasses.replace(gridded, window="none"))
+    assert set(between) == {"relative_error_between", "relative_error_between_theta_i"}
+
+
+def test_the_data_basis_is_a_singular_value_decomposition(rng):
+    spectra = rng.normal(size=(3, 20, 9)) * np.array([1.0, 100.0, 0.01])[:, None, None]
+    basis = data_basis(WAVELENGTH_NM, spectra, 4)
+    scaled = spectra / np.linalg.norm(spectra, axis=(1, 2), keepdims=True)
+    vectors = np.linalg.svd(scaled.reshape(-1, 9))[2][:4]
+    np.testing.assert_allclose(abs(vectors @ basis.synthesis.T), np.eye(4), rtol=0, atol=1e3 * ROUND)
+    coefficient = encode(spectra, basis)
+    np.testing.assert_allclose(decode(coefficient, basis), spectra @ vectors.T @ vectors, rtol=0, atol=1e3 * ROUND)
+    assert coefficients_allowed(9, 12, "data")[:2] == ("data", 9)
+    assert coefficients_allowed(3, 12, "data").kind == "identity"
+    with pytest.raises(ValueError, match="data_basis"):
+        make_basis(WAVELENGTH_NM, "data", 3)
