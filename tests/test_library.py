@@ -115,7 +115,7 @@ def test_a_table_sets_keys_by_columns(folder):
     (folder / "library.yaml").write_text(lines)
     first, second = load_library(folder / "library.yaml").materials
     assert (first.name, first.options.input.path) == ("a", str(folder / "raw" / "b.txt"))
-    assert first.options.represent.max_degree == 2 and second.options.represent.max_degree == 4
+    assert first.options.represent.max_degree == 2 and second.options.represent.max_degree == 8
     assert second.options.input.path == "builtin:amber_glass"
     assert second.options.validate.fold_file == str(folder / "folds.csv")
 
