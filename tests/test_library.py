@@ -97,7 +97,7 @@ def test_the_example_holds_every_default():
     ]
     assert library.executor == type(library.executor)()
     assert str(library.folder) == "results/library"
-    assert {material.options.represent.lobe for material in library.materials} == {"best", "tan_squared"}
+    assert {material.options.represent.target.numbers for material in library.materials} == {None, 300}
     assert not library.materials[0].options.output.report
 
 
