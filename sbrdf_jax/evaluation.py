@@ -19,7 +19,7 @@ from sbrdf_jax.encoding import decode
 from sbrdf_jax.interpolation import spectral_weights
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralField
 from sbrdf_jax.representation.paper import compact_coefficient
-from sbrdf_jax.representation.tensor_value import tensor_value
+from sbrdf_jax.representation.tensor_value import pad_ranks, tensor_value
 from sbrdf_jax.resampling.guided.field import (
     GuidedField,
     each_direction,
@@ -238,6 +238,8 @@ def evaluate_in_chunks(
         MOST_AT_A_TIME,
     )
     value = np.empty((count, num_wavelengths))
+    if isinstance(result, LobeTensor):
+        result = pad_ranks(result)
     result = jax.tree.map(jnp.asarray, result)  # to the device once, not with every chunk
     for start in range(0, count, size):
         part = [a[start : start + size] for a in flat]

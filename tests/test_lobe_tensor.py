@@ -20,6 +20,7 @@ from sbrdf_jax.records import GriddedBRDF, SpectralField, Status
 from sbrdf_jax.representation import represent, represent_with_plan
 from sbrdf_jax.representation.direction_functions import direction_functions, num_direction_functions
 from sbrdf_jax.representation.tensor_fit import Normal, TensorFit
+from sbrdf_jax.representation.tensor_value import pad_ranks
 from sbrdf_jax.splines import spline_weights
 
 ROUND = tolerance(ROUNDING, np.float64)
@@ -156,6 +157,17 @@ def test_never_negative_and_finite_with_gradients_everywhere(amber, rng):
         numeric = np.asarray(ahead - behind) / (2 * step)
         error = np.abs(numeric - np.asarray(slope(at[:20]))[:, axis]).max() / (np.abs(numeric).max() + 1)
         assert error < 1e2 * tolerance(GRADIENT, np.float64)  # a clip at 0 or a sharp lobe within the step
+
+
+def test_zeros_up_to_shared_ranks_change_nothing(amber, rng):
+    _, _, tensor = amber
+    padded = pad_ranks(tensor)
+    assert all(rank % 8 == 0 for rank in padded.core.shape)
+    angles = [jnp.asarray(a) for a in rng.uniform(0, np.pi / 2, (3, 20))]
+    for wavelength_nm in (None, jnp.asarray([430.0, 655.0])):
+        expected = evaluate(tensor, *angles, wavelength_nm)
+        found = evaluate(padded, *angles, wavelength_nm)
+        np.testing.assert_allclose(found, expected, rtol=ROUND, atol=1e-13)
 
 
 def test_the_group_alone_evaluates_to_the_same_numbers(amber, tmp_path, rng):

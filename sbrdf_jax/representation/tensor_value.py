@@ -1,5 +1,7 @@
 """A lobe tensor's value in any direction; pure, for jit, vmap and grad."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,24 @@ from sbrdf_jax.encoding import decode
 from sbrdf_jax.records import LobeTensor
 from sbrdf_jax.representation.direction_functions import direction_functions
 from sbrdf_jax.splines import spline_weights
+
+RANK_STEP = 8
+
+
+def pad_ranks(tensor: LobeTensor) -> LobeTensor:
+    """Return the same tensor with zeros up to ranks of a multiple of 8, so that most tensors share compiled code."""
+    core = np.asarray(tensor.core)
+    more = [-rank % RANK_STEP for rank in core.shape]
+    if tensor.basis.kind != "data":
+        more[3] = 0  # the config fixes how many
+    names = ("theta_i_factor", "theta_o_factor", "direction_factor")
+    factors = {name: np.pad(getattr(tensor, name), ((0, 0), (0, n))) for name, n in zip(names, more, strict=False)}
+    basis = dataclasses.replace(
+        tensor.basis,
+        analysis=np.pad(tensor.basis.analysis, ((0, 0), (0, more[3]))),
+        synthesis=np.pad(tensor.basis.synthesis, ((0, more[3]), (0, 0))),
+    )
+    return dataclasses.replace(tensor, **factors, core=np.pad(core, [(0, n) for n in more]), basis=basis)
 
 
 def tensor_value(
