@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.compact_baselines import BASELINES
+from benchmarks.solver import CORNELL
 
-CORNELL = Path(__file__).resolve().parents[2] / "shared" / "data" / "cornell"
 GLASSES = ("amber_glass", "amber_glass_sharp", "amber_glass_broad")
 SIZES = (64, 107, 214, 513)
 ERRORS = (0.045, 0.01)
@@ -63,13 +63,14 @@ def measure(name: str, *, with_paper: bool) -> dict[str, list[tuple[float, float
     """Print the table of one material and return (numbers, median, worst) of each method."""
     from sbrdf_jax.colour import colour_matching
     from sbrdf_jax.encoding import data_basis, encode_field, make_basis
+    from sbrdf_jax.grid import has_data
     from sbrdf_jax.metrics import error_at_nodes, error_between, off_node_scores, stored_numbers
     from sbrdf_jax.options import RepresentOptions, TargetOptions
     from sbrdf_jax.representation import represent
 
     gridded = gridded_field(name)
     wavelength_nm, brdf = np.asarray(gridded.wavelength_nm), np.asarray(gridded.brdf)
-    known = ~np.all(np.asarray(gridded.extrapolated) == 2, axis=(1, 2))
+    known = has_data(gridded)
     matching = colour_matching(wavelength_nm)
     field = encode_field(gridded, data_basis(wavelength_nm, brdf[known], 12))
     per_angle = len(known)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-CORNELL = Path(__file__).resolve().parents[2] / "shared" / "data" / "cornell"
+from benchmarks.solver import CORNELL
 
 
 def main(files: list[str]) -> None:

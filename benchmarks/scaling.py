@@ -6,7 +6,6 @@ a sweep.
 """
 
 import argparse
-import dataclasses
 import json
 import resource
 import subprocess
@@ -14,6 +13,8 @@ import sys
 import time
 
 import numpy as np
+
+from benchmarks.solver import thinned
 
 SAMPLES = (1_000, 10_000, 100_000, 1_000_000)
 STEPS_DEG = (15.0, 7.5, 5.0, 3.0, 2.0, 1.0)
@@ -40,8 +41,7 @@ def measure_point(method: str, count: int, step_deg: float) -> dict[str, float]:
     lines = f"input: {{path: builtin:amber_glass}}\ngrid: {grid}\nresample: {{method: {method}}}"
     options = resolve(parse_config(lines))
     raw = measure("amber_glass", count=-(-count // NUM_INCIDENCES))
-    few = np.linspace(0, len(raw.wavelength_nm) - 1, NUM_WAVELENGTHS).astype(int)
-    raw = dataclasses.replace(raw, wavelength_nm=raw.wavelength_nm[few], value=raw.value[:, few])
+    raw = thinned(raw, NUM_WAVELENGTHS)
     start = time.perf_counter()
     cleaned = clean(raw, bilateral="auto", method=method)
     clean_seconds = time.perf_counter() - start

@@ -13,7 +13,7 @@ import scipy.sparse
 
 from sbrdf_jax.coverage import SAME_INCIDENCE, cluster_incidences
 from sbrdf_jax.options import GridOptions
-from sbrdf_jax.records import RawSamples
+from sbrdf_jax.records import GriddedBRDF, RawSamples
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,6 +138,17 @@ def second_difference_rows(grid: Grid) -> scipy.sparse.csr_array:
     stencil = np.broadcast_to([1.0, -2.0, 1.0], columns.shape)
     shape = (len(columns), grid.num_unknowns)
     return scipy.sparse.coo_array((stencil.ravel(), (rows.ravel(), columns.ravel())), shape=shape).tocsr()
+
+
+def midpoints(axis) -> np.ndarray:
+    """Midpoints of the cells of an axis."""
+    axis = np.asarray(axis)
+    return (axis[:-1] + axis[1:]) / 2
+
+
+def has_data(gridded: GriddedBRDF) -> np.ndarray:
+    """Mask [theta_i] of the incident angles with a node that is not beyond the measured range."""
+    return ~np.all(np.asarray(gridded.extrapolated) == 2, axis=(1, 2))
 
 
 def _quarter_circle(step_deg: float) -> np.ndarray:

@@ -16,6 +16,7 @@ from sbrdf_jax import colour
 from sbrdf_jax.angles import angle_between
 from sbrdf_jax.encoding import decode
 from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_on_axes, measured_wavelengths
+from sbrdf_jax.grid import midpoints
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralBasis, SpectralField
 from sbrdf_jax.representation import lobe_tensor
 from sbrdf_jax.representation.paper import compact_coefficient
@@ -302,12 +303,6 @@ def albedo_warnings(albedo: np.ndarray, result, stage: str) -> list[str]:
                 "it creates energy"
             )
     return warnings
-
-
-def midpoints(axis) -> np.ndarray:
-    """Midpoints of the cells of an axis."""
-    axis = np.asarray(axis)
-    return (axis[:-1] + axis[1:]) / 2
 
 
 def on_axes(result, theta_i: float, theta_o, phi_o) -> Float[np.ndarray, "theta_o phi_o wavelength"]:

@@ -9,7 +9,7 @@ import numpy as np
 from sbrdf_jax.cleaning import CleanResult, clean
 from sbrdf_jax.encoding import coefficients_allowed, data_basis, encode_field, make_basis
 from sbrdf_jax.folds import LEAVE_ONE_OUT, Folds, make_folds
-from sbrdf_jax.grid import Grid, make_grid
+from sbrdf_jax.grid import Grid, has_data, make_grid
 from sbrdf_jax.metrics import live_wavelengths, measure
 from sbrdf_jax.options import EncodeOptions, RunOptions
 from sbrdf_jax.plan import PlanRow, plan_run, plan_validation
@@ -143,7 +143,7 @@ def spectral_basis(gridded: GriddedBRDF, options: EncodeOptions) -> SpectralBasi
     allowed = coefficients_allowed(len(wavelength_nm), wanted, options.basis)
     if allowed.kind != "data":
         return make_basis(wavelength_nm, allowed.kind, wanted)
-    known = ~np.all(np.asarray(gridded.extrapolated) == 2, axis=(1, 2))
+    known = has_data(gridded)
     brdf = np.asarray(gridded.brdf)
     return data_basis(wavelength_nm, brdf[known] if known.any() else brdf, allowed.coefficients)
 

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import PchipInterpolator
 
 from sbrdf_jax.evaluation import evaluate_on_axes
+from sbrdf_jax.grid import has_data, midpoints
 from sbrdf_jax.records import GriddedBRDF, SpectralField
 
 UNKNOWN_WEIGHT = 0.01  # of an incident angle without data: it does not count, but is not to run wild
@@ -15,7 +16,6 @@ GUESS_WEIGHT = 1e-3  # where it is interpolated: enough that nothing runs wild
 RELATIVE_SHARE = 0.03  # of the error relative to each direction's own energy
 RELATIVE_FLOOR = 1e-3  # of the mean energy of a direction
 SMALLEST = 1e-9  # of the largest value; logarithms of less are not taken
-TOLERANCE = 1e-6  # of an angle's side of the plane: twins that differ by more are not mirror images
 
 
 class Block(NamedTuple):
@@ -58,7 +58,7 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
     usable = np.isfinite(energy) & (energy > 0)
     known = usable.copy()
     if gridded is not None:
-        known &= ~np.all(np.asarray(gridded.extrapolated) == 2, axis=(1, 2))
+        known &= has_data(gridded)
     if not known.any():
         known = usable
     if not usable.any():
@@ -68,7 +68,7 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
     share = np.where(known, 1.0, np.where(usable, UNKNOWN_WEIGHT, 0.0))[place]
     weight = np.where(np.arange(count) == count - 1, 1.0, 2.0)  # phi_o = 180 degrees is one node, others have twins
     nodes = _block(theta_i[place], theta_o, phi_o[:count], even[place], weight, share)
-    mid_o, mid_phi = _midpoints(theta_o), _midpoints(phi_o[:count])
+    mid_o, mid_phi = midpoints(theta_o), midpoints(phi_o[:count])
     twins = np.full(len(mid_phi), 2.0)
     less = np.minimum(share[:-1], share[1:])
     if gridded is None or gridded.field is None:
@@ -78,10 +78,10 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
             phi = np.sort(np.concatenate([nodes.phi_o, mid_phi]))
             tracked, brdf = _along_mirror_track(nodes, phi)
             both = np.where(np.arange(len(phi)) == len(phi) - 1, 1.0, 2.0)
-            blocks.append(_block(_midpoints(nodes.theta_i), tracked, phi, brdf, both, GUESS_WEIGHT * less))
+            blocks.append(_block(midpoints(nodes.theta_i), tracked, phi, brdf, both, GUESS_WEIGHT * less))
         return HalfField(tuple(blocks), known, asymmetry)
     finite = np.isin(np.asarray(gridded.field.wavelength_nm), np.asarray(field.basis.wavelength_nm))
-    mid_i = _midpoints(nodes.theta_i) if field.interpolate_theta_i else np.empty(0)
+    mid_i = midpoints(nodes.theta_i) if field.interpolate_theta_i else np.empty(0)
     both = np.concatenate([nodes.theta_i, mid_i])
     between = evaluate_on_axes(gridded, both, mid_o, mid_phi)[..., finite]
     on, midway = np.split(between, [len(nodes.theta_i)])
@@ -110,10 +110,6 @@ def _block(theta_i, theta_o, phi_o, brdf, twins, share) -> Block:
 
 def _energy(brdf, twins):
     return np.einsum("iopw,iopw,p->i", brdf, brdf, twins)
-
-
-def _midpoints(axis):
-    return (axis[:-1] + axis[1:]) / 2
 
 
 def _logarithm(nodes: Block):
