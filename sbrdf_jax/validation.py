@@ -8,19 +8,21 @@ whole measurement. Any method is validated in the same way, through `predict`.
 import dataclasses
 from collections.abc import Callable, Mapping
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sbrdf_jax.angles import half_angle
 from sbrdf_jax.cleaning import DROPPED, CleanReport, clean
 from sbrdf_jax.coverage import cluster_incidences
-from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_standard_error
+from sbrdf_jax.evaluation import evaluate_in_chunks
 from sbrdf_jax.folds import LEAVE_ONE_OUT, Folds
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.options import ResampleOptions
 from sbrdf_jax.records import RawSamples
 from sbrdf_jax.resampling import resample
 from sbrdf_jax.resampling.guided import Centres, fit_field, place_centres
+from sbrdf_jax.resampling.guided.field import evaluate_with_error
 from sbrdf_jax.scores import coverage, coverage_by, held_out_scores, scores_by_half_angle
 
 
@@ -70,8 +72,8 @@ def predict(
     angles = theta_i, theta_o, phi_o
     if options.method == "guided":
         fit = fit_field(train, options, report, None if centres is None else centres.take(train.row))
-        error, noise = evaluate_standard_error(fit.field, *angles)
-        return Prediction(evaluate_in_chunks(fit.field, *angles), fit.status, np.hypot(error, noise))
+        value, error, noise = evaluate_with_error(fit.field, jnp.asarray(fit.whiten), *map(jnp.asarray, angles))
+        return Prediction(np.asarray(value), fit.status, np.hypot(error, noise))
     gridded = resample(train, grid, options, report)
     return Prediction(evaluate_in_chunks(gridded, *angles), np.asarray(gridded.status, int))
 
