@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.interpolation import spectral_weights
 from sbrdf_jax.records import GriddedBRDF, SpectralBasis, SpectralField
 
@@ -121,7 +122,8 @@ def data_basis(
 
 def spectral_vectors(spectra: Float[np.ndarray, "row wavelength"]) -> Float[np.ndarray, "vector wavelength"]:
     """Return all right singular vectors of spectra, the most important first."""
-    vectors = np.linalg.eigh(spectra.T @ spectra)[1][:, ::-1].T
+    with one_blas_thread():
+        vectors = np.linalg.eigh(spectra.T @ spectra)[1][:, ::-1].T
     return vectors * np.where(vectors.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
 
 

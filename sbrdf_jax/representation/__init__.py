@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.options import RepresentOptions
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralField
 
@@ -29,4 +30,5 @@ def represent_with_plan(
 
     if options.method == "paper":
         return paper.represent(field, options)
-    return lobe_tensor.represent(field, options, gridded)
+    with one_blas_thread():
+        return lobe_tensor.represent(field, options, gridded)

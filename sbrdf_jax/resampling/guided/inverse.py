@@ -1,26 +1,10 @@
-"""The inverse of prior covariance plus noise, on the host, and the closed forms that it gives.
-
-One BLAS thread: two that wait for a core that another process holds take ten times longer
-than one that works, and these matrices are too small for a second thread to matter.
-"""
-
-import contextlib
-import functools
+"""The inverse of prior covariance plus noise, on the host, and the closed forms that it gives."""
 
 import numpy as np
 import scipy.linalg.blas
 import scipy.linalg.lapack
-from threadpoolctl import ThreadpoolController
 
-
-def one_blas_thread() -> contextlib.AbstractContextManager:
-    """Hold the host's BLAS to one thread for a while."""
-    return _controller().limit(limits=1, user_api="blas")
-
-
-@functools.cache
-def _controller() -> ThreadpoolController:
-    return ThreadpoolController()
+from sbrdf_jax.host_blas import one_blas_thread
 
 
 def lower_inverse(prior: np.ndarray, noise: np.ndarray) -> np.ndarray:
