@@ -15,12 +15,12 @@ from sbrdf_jax.encoding import coefficient_names
 from sbrdf_jax.hdf5 import attribute, dataset, dataset_of, degrees, read, read_mapping, scale, write_mapping
 from sbrdf_jax.records import GriddedBRDF, SpectralField
 from sbrdf_jax.resampling.guided.error_model import ResidualScale
-from sbrdf_jax.resampling.guided.field import GuidedField
+from sbrdf_jax.resampling.guided.field import GuidedField, MeasuredLobe
 from sbrdf_jax.resampling.guided.lobe_model import SHAPE_NAMES, LobeModel
 from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, mirror
 from sbrdf_jax.scores import SCORE_TEXT
 
-GUIDED_PARTS = {"lobe": LobeModel, "variance": ModeVariance, "scale": ResidualScale}
+GUIDED_PARTS = {"lobe": LobeModel, "variance": ModeVariance, "scale": ResidualScale, "measured": MeasuredLobe}
 _ANGLES = ("theta_i", "theta_o", "phi_o")
 
 # Axes and units of what validation stores, by the last part of the name; scores and counts have neither.

@@ -17,8 +17,8 @@ from sbrdf_jax.progress import Progress, StageClock
 from sbrdf_jax.records import STATUS_TEXT, GriddedBRDF, RawSamples, SpectralBasis, Status
 from sbrdf_jax.representation import represent_with_plan
 from sbrdf_jax.resampling import resample
-from sbrdf_jax.resampling.geometry import Geometry
 from sbrdf_jax.resampling.guided import describe_fit
+from sbrdf_jax.resampling.kept import Kept
 from sbrdf_jax.runtime import compile_clock
 from sbrdf_jax.store import RunResult
 from sbrdf_jax.summary import count_statuses
@@ -65,7 +65,7 @@ def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
 
 
 def process(
-    raw: RawSamples, ready: Prepared, options: RunOptions, progress: Progress, geometry: Geometry | None = None
+    raw: RawSamples, ready: Prepared, options: RunOptions, progress: Progress, kept: Kept | None = None
 ) -> RunResult:
     """Run every stage on one measurement.
 
@@ -74,7 +74,7 @@ def process(
         ready: What `prepare` made of it.
         options: Resolved options.
         progress: Told of each stage.
-        geometry: What the measurement before it may have worked out, and the next one may use.
+        kept: What the run before it may have worked out, and the next one may use.
 
     Returns:
         The result, but for what only its caller knows: config text, time of creation, versions.
@@ -87,7 +87,7 @@ def process(
             ready.grid,
             options.resample,
             progress.update,
-            geometry,
+            kept,
         )
     notes = () if gridded.field is None else describe_fit(gridded.field)
 

@@ -90,6 +90,7 @@ class GriddedBRDF:
     interpolate_theta_i: bool = True
     standard_error: Any = None  # [theta_i, theta_o, phi_o, wavelength] 1/sr, where the method has one
     field: Any = None  # what evaluates any direction, where that is more than the nodes
+    needed: Any = None  # [theta_i, theta_o, phi_o] bool: nodes that were computed, the others are nan; None: all
 
 
 @pytree(static=("kind", "uniform"))

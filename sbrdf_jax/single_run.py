@@ -10,7 +10,7 @@ from sbrdf_jax.options import RunOptions
 from sbrdf_jax.pipeline import Prepared, process
 from sbrdf_jax.progress import Progress
 from sbrdf_jax.records import RawSamples
-from sbrdf_jax.resampling.geometry import Geometry
+from sbrdf_jax.resampling.kept import Kept
 from sbrdf_jax.runtime import versions
 from sbrdf_jax.store import RunResult, save
 
@@ -36,7 +36,7 @@ def run_to_file(
     options: RunOptions,
     progress: Progress,
     set_up_seconds: float,
-    geometry: Geometry | None = None,
+    kept: Kept | None = None,
 ) -> RunResult:
     """Run every stage, write the result under `output.path`, and its report where that is asked for.
 
@@ -46,7 +46,7 @@ def run_to_file(
         options: Resolved options.
         progress: Told of each stage.
         set_up_seconds: Seconds up to here, for the result's `timing`.
-        geometry: As for `pipeline.process`.
+        kept: As for `pipeline.process`.
 
     Returns:
         The result, as written.
@@ -55,7 +55,7 @@ def run_to_file(
         UserError: The result cannot be written.
     """
     output = Path(options.output.path)
-    result = process(raw, ready, options, progress, geometry)
+    result = process(raw, ready, options, progress, kept)
     set_up = {"set_up": {"total": set_up_seconds, "compile": 0.0, "run": set_up_seconds}}
     result = dataclasses.replace(
         result,

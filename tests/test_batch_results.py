@@ -12,7 +12,7 @@ from sbrdf_jax.batch.states import State
 from sbrdf_jax.cli import main
 from sbrdf_jax.formats import write_samples
 from sbrdf_jax.hdf5 import dataset_of
-from sbrdf_jax.resampling.geometry import Geometry
+from sbrdf_jax.resampling.kept import Kept
 
 BASE = """
 grid: {theta_i_step_deg: 30, theta_o_step_deg: 22.5, phi_o_step_deg: 45}
@@ -49,8 +49,8 @@ def assert_same_datasets(first, second) -> None:
 def test_a_material_of_a_batch_is_what_run_computes(tmp_path, monkeypatch):
     library = small_library(tmp_path, 2)
     inverted = []
-    original = Geometry.inverse
-    monkeypatch.setattr(Geometry, "inverse", lambda self, op: inverted.append(original(self, op)) or inverted[-1])
+    original = Kept.inverse
+    monkeypatch.setattr(Kept, "inverse", lambda self, op: inverted.append(original(self, op)) or inverted[-1])
     memory, compute, compiled = Memory(), ComputeMaterial(), []
     first = attempt(library.materials[0], compute, memory)
     jax.monitoring.register_event_duration_secs_listener(lambda event, duration_secs, **kwargs: compiled.append(event))

@@ -65,20 +65,20 @@ class ComputeMaterial:
 
     def __init__(self):
         """Begin with nothing known."""
-        self._geometry: Any = None
+        self._kept: Any = None
 
     def __call__(self, material: Material) -> None:
         """Write the result of a material."""
         start = time.perf_counter()
         from sbrdf_jax.formats import read
         from sbrdf_jax.pipeline import prepare
-        from sbrdf_jax.resampling.geometry import Geometry
+        from sbrdf_jax.resampling.kept import Kept
         from sbrdf_jax.runtime import set_up_jax
         from sbrdf_jax.single_run import open_progress, run_to_file
         from sbrdf_jax.stopping import before_stopping
 
         set_up_jax()
-        self._geometry = self._geometry or Geometry()
+        self._kept = self._kept or Kept()
         options = material.options
         with (
             open_progress(material.result, quiet=True) as progress,
@@ -87,7 +87,7 @@ class ComputeMaterial:
             try:
                 raw = read(options.input.path, options.input)
                 ready = prepare(raw, options)
-                run_to_file(raw, ready, options, progress, time.perf_counter() - start, self._geometry)
+                run_to_file(raw, ready, options, progress, time.perf_counter() - start, self._kept)
             except Exception:
                 for line in traceback.format_exc().splitlines():
                     progress.log(line)

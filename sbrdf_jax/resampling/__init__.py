@@ -2,11 +2,14 @@
 
 from collections.abc import Callable
 
+import numpy as np
+
 from sbrdf_jax.grid import Grid
+from sbrdf_jax.needs import Needs
 from sbrdf_jax.options import ResampleOptions
 from sbrdf_jax.records import GriddedBRDF, RawSamples
-from sbrdf_jax.resampling.geometry import Geometry
 from sbrdf_jax.resampling.guided import resample_guided
+from sbrdf_jax.resampling.kept import Kept
 from sbrdf_jax.resampling.paper import resample_paper
 
 
@@ -15,27 +18,34 @@ def resample(
     grid: Grid,
     options: ResampleOptions,
     report: Callable[[str], None] | None = None,
-    geometry: Geometry | None = None,
+    kept: Kept | None = None,
+    needs: Needs | None = None,
+    known: GriddedBRDF | None = None,
 ) -> GriddedBRDF:
     """Resample a measurement by the method that the options name.
 
     Args:
-        samples: Cleaned measurement.
+        samples: Cleaned measurement, all wavelengths of it.
         grid: Nodes and ties, from `make_grid`.
         options: Resolved options.
         report: Told how far it is.
-        geometry: What the measurement before it may have worked out, and the next one may use.
+        kept: What the run before it may have worked out, and the next one may use.
+        needs: What is needed of it; None: everything. Method "paper" couples all nodes and skips wavelengths alone.
+        known: An earlier answer for the same samples, grid and options, of which what is needed is taken over.
 
     Returns:
-        The field on the grid.
+        The field on the grid, at the wavelengths and incident angles that are needed.
 
     Raises:
         ValueError: The method is not built.
     """
-    geometry = geometry or Geometry()
+    kept = kept or Kept()
     if options.method == "paper":
         say = None if report is None else (lambda done, total: report(f"{done} of {total} wavelengths converged"))
-        return resample_paper(samples, grid, options, say, geometry.inverse)
+        wanted = np.ones(len(samples.wavelength_nm), bool) if needs is None else needs.wavelength
+        return resample_paper(samples, grid, options, say, kept.inverse, wanted=wanted, known=known)
     if options.method == "guided":
-        return resample_guided(samples, grid, options, report, geometry.centres(samples, grid.reciprocal))
+        centres = kept.centres(samples, grid.reciprocal)
+        estimates = kept.estimates(samples, options, centres, report, None if known is None else known.field)
+        return resample_guided(samples, grid, options, report, centres, estimates=estimates, needs=needs, known=known)
     raise ValueError(f"resample method {options.method!r} is not available; it is paper or guided")

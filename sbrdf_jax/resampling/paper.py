@@ -1,5 +1,6 @@
 """Resampling as the paper has it: eqs. (4) to (10), every wavelength at once."""
 
+import dataclasses
 from collections.abc import Callable
 
 import jax.numpy as jnp
@@ -21,6 +22,9 @@ def resample_paper(
     options: ResampleOptions,
     report: Callable[[int, int], None] | None = None,
     invert: Callable[[TiedGridNormal], InverseNormal | None] = invert_normal,
+    *,
+    wanted: np.ndarray | None = None,
+    known: GriddedBRDF | None = None,
 ) -> GriddedBRDF:
     """Fit the non-negative grid whose sinc interpolation is nearest to the samples.
 
@@ -34,10 +38,17 @@ def resample_paper(
         report: Called with (wavelengths converged, wavelengths) as the solver goes.
         invert: Gives the inverse of A'A; it depends on the samples' angles, the grid and the
             weight, so one serves every material of a geometry.
+        wanted: Mask of the wavelengths that are needed; None: all.
+        known: An earlier answer for the same samples, grid and options, whose wavelengths are taken over.
 
     Returns:
         The grid with its certificate; nowhere negative, one value at each pole.
     """
+    if wanted is not None and not wanted.all():
+        part = {"wavelength_nm": samples.wavelength_nm[wanted], "value": samples.value[:, wanted]}
+        samples = dataclasses.replace(samples, **part)
+    if known is not None and np.isin(samples.wavelength_nm, known.wavelength_nm).any():
+        return _with_known(known, samples, lambda fresh: resample_paper(fresh, grid, options, report, invert))
     operator, rhs = normal_equations(samples, grid, float(options.smoothness_weight))
     found = solve_normal(operator, rhs, float(options.tolerance), invert(operator), report)
     return GriddedBRDF(
@@ -55,6 +66,23 @@ def resample_paper(
         bilateral=grid.bilateral,
         interpolate_theta_i=grid.interpolate_theta_i,
     )
+
+
+def _with_known(known: GriddedBRDF, samples: RawSamples, solve: Callable[[RawSamples], GriddedBRDF]) -> GriddedBRDF:
+    """Return an answer at the samples' wavelengths, of which only those are solved that an earlier one lacks."""
+    fresh = ~np.isin(samples.wavelength_nm, known.wavelength_nm)
+    old = np.isin(known.wavelength_nm, samples.wavelength_nm)
+    per_wavelength = ("wavelength_nm", "brdf", "kkt_residual", "num_steps", "status")
+    parts = {name: np.asarray(getattr(known, name))[..., old] for name in per_wavelength}
+    if fresh.any():
+        part = {"wavelength_nm": samples.wavelength_nm[fresh], "value": samples.value[:, fresh]}
+        solved = solve(dataclasses.replace(samples, **part))
+        order = np.argsort(np.concatenate([parts["wavelength_nm"], solved.wavelength_nm]))
+        parts = {
+            name: np.concatenate([value, np.asarray(getattr(solved, name))], axis=-1)[..., order]
+            for name, value in parts.items()
+        }
+    return dataclasses.replace(known, **{name: jnp.asarray(value) for name, value in parts.items()})
 
 
 def solve_normal(

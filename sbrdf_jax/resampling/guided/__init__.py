@@ -11,16 +11,30 @@ import jax.numpy as jnp
 import numpy as np
 
 from sbrdf_jax.grid import Grid
+from sbrdf_jax.needs import Needs, everything
 from sbrdf_jax.options import ResampleOptions
 from sbrdf_jax.records import GriddedBRDF, RawSamples, Status
 from sbrdf_jax.resampling.extrapolation import extrapolated_nodes
 from sbrdf_jax.resampling.guided.centres import PADDING_NOISE, Centres, place_centres
 from sbrdf_jax.resampling.guided.coordinates import guided_coordinates
-from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_with_error
-from sbrdf_jax.resampling.guided.fit import GuidedFit, fit_guided
+from sbrdf_jax.resampling.guided.estimates import Estimates, estimate
+from sbrdf_jax.resampling.guided.field import GuidedField
+from sbrdf_jax.resampling.guided.fit import GuidedFit, solve_field
+from sbrdf_jax.resampling.guided.lanes import join_fits, spread, take_fit, with_dead_wavelengths
 from sbrdf_jax.resampling.guided.lobe_model import lobe_terms
+from sbrdf_jax.resampling.guided.reading import read_nodes
 
-__all__ = ["Centres", "GuidedField", "describe_fit", "fit_field", "place_centres", "resample_guided"]
+__all__ = [
+    "Centres",
+    "Estimates",
+    "GuidedField",
+    "describe_fit",
+    "estimate_whole",
+    "fit_field",
+    "place_centres",
+    "resample_guided",
+]
+
 
 CONTRADICTED = 1.2  # growth of the left-out errors from which reciprocity is doubted
 MIRROR_TERM = 1  # of the lobe model
@@ -29,11 +43,25 @@ SPIKE_THETA = np.pi / 4  # where the mirror image is compared with the other ter
 DOUBTED = 1.5  # noise variance, relative, of a direction that is said to have lost weight
 
 
+def estimate_whole(
+    samples: RawSamples, options: ResampleOptions, centres: Centres, report: Callable[[str], None] | None = None
+) -> Estimates:
+    """Estimate what depends on the whole measurement, from the wavelengths that are finite and hold light."""
+    live = _live(samples)
+    part = dataclasses.replace(samples, wavelength_nm=samples.wavelength_nm[live], value=samples.value[:, live])
+    weight = None if isinstance(options.smoothness_weight, str) else float(options.smoothness_weight)
+    return estimate(part, weight, centres, report)
+
+
 def fit_field(
     samples: RawSamples,
     options: ResampleOptions,
     report: Callable[[str], None] | None = None,
     centres: Centres | None = None,
+    *,
+    needed: np.ndarray | None = None,
+    estimates: Estimates | None = None,
+    known: GuidedFit | None = None,
 ) -> GuidedFit:
     """Fit the guided field to cleaned samples, whatever their wavelengths hold.
 
@@ -43,12 +71,23 @@ def fit_field(
         options: `smoothness_weight` ("data" or the noise variance relative to the prior's) and `tolerance`.
         report: Told of each step.
         centres: Where the samples are; several fits may share what depends on angles alone.
+        needed: Mask of the wavelengths that are wanted, which change nothing of each other; None: all.
+        estimates: Of the whole measurement, where they have been made.
+        known: A fit to the same samples, whose wavelengths need not be solved again.
     """
-    finite = np.isfinite(samples.value).all(axis=0)
-    live = finite & (samples.value > 0).any(axis=0)
-    part = dataclasses.replace(samples, wavelength_nm=samples.wavelength_nm[live], value=samples.value[:, live])
-    weight = None if isinstance(options.smoothness_weight, str) else float(options.smoothness_weight)
-    fit = fit_guided(part, weight=weight, tolerance=float(options.tolerance), centres=centres, report=report)
+    centres = centres or place_centres(samples)
+    estimates = estimates or estimate_whole(samples, options, centres, report)
+    needed = np.ones(len(samples.wavelength_nm), bool) if needed is None else needed
+    finite, live = np.isfinite(samples.value).all(axis=0), _live(samples)
+    wanted = samples.wavelength_nm[needed & live]
+    held = np.zeros(0) if known is None else np.intersect1d(wanted, known.field.wavelength_nm)
+    fresh = np.isin(estimates.wavelength_nm, wanted) & ~np.isin(estimates.wavelength_nm, held)
+    if report is not None:
+        report(f"bounded least squares, {fresh.sum()} wavelengths")
+    fit = solve_field(estimates, centres, fresh, float(options.tolerance))
+    if known is not None and len(held):
+        fit = join_fits(take_fit(known, np.isin(known.field.wavelength_nm, held)), fit)
+    wavelength_nm, finite, live = samples.wavelength_nm[needed], finite[needed], live[needed]
     missing = np.where(finite, 0.0, np.nan)
     is_finite = np.isfinite(np.asarray(fit.field.half)).all(axis=(0, 1, 2))
     status = np.where(finite, int(Status.OK), int(Status.NONFINITE))
@@ -56,8 +95,8 @@ def fit_field(
     num_steps = np.zeros(len(live), int)
     num_steps[live] = fit.num_steps
     return GuidedFit(
-        field=_with_dead_wavelengths(fit.field, samples.wavelength_nm, live, missing),
-        kkt_residual=_spread(fit.kkt_residual, live, missing),
+        field=with_dead_wavelengths(fit.field, wavelength_nm, live, missing),
+        kkt_residual=spread(fit.kkt_residual, live, missing),
         num_steps=num_steps,
         status=status,
         whiten=fit.whiten,
@@ -70,6 +109,10 @@ def resample_guided(
     options: ResampleOptions,
     report: Callable[[str], None] | None = None,
     centres: Centres | None = None,
+    *,
+    estimates: Estimates | None = None,
+    needs: Needs | None = None,
+    known: GriddedBRDF | None = None,
 ) -> GriddedBRDF:
     """Fit the guided field, and read it and its standard error off at the grid's nodes.
 
@@ -79,16 +122,27 @@ def resample_guided(
         options: As for `fit_field`.
         report: Told of each step.
         centres: As for `fit_field`.
+        estimates: As for `fit_field`.
+        needs: Which wavelengths and nodes; None: all. Skipped incident angles and wavelengths have no place in
+            the answer, other skipped nodes are nan.
+        known: An earlier answer for the same samples and options, of which what is needed is taken over.
     """
-    fit = fit_field(samples, options, report, centres or place_centres(samples, grid.reciprocal))
-    value, error = read_nodes(fit.field, grid, fit.whiten)
+    needs = needs or everything(grid, len(samples.wavelength_nm))
+    centres = centres or place_centres(samples, grid.reciprocal)
+    estimates = estimates or estimate_whole(samples, options, centres, report)
+    earlier = None if known is None else fit_of(known, estimates.whiten)
+    fit = fit_field(samples, options, report, centres, needed=needs.wavelength, estimates=estimates, known=earlier)
+    if report is not None:
+        report("nodes")
+    value, error = read_nodes(fit.field, grid, fit.whiten, needs.node, known)
+    theta_i = needs.theta_i
     return GriddedBRDF(
-        theta_i=jnp.asarray(grid.theta_i),
+        theta_i=jnp.asarray(grid.theta_i[theta_i]),
         theta_o=jnp.asarray(grid.theta_o),
         phi_o=jnp.asarray(grid.phi_o),
-        wavelength_nm=jnp.asarray(samples.wavelength_nm),
+        wavelength_nm=jnp.asarray(samples.wavelength_nm[needs.wavelength]),
         brdf=jnp.asarray(value),
-        extrapolated=jnp.asarray(extrapolated_nodes(samples, grid)),
+        extrapolated=jnp.asarray(extrapolated_nodes(samples, grid)[theta_i]),
         kkt_residual=jnp.asarray(fit.kkt_residual),
         num_steps=jnp.asarray(fit.num_steps),
         status=jnp.asarray(fit.status),
@@ -98,29 +152,15 @@ def resample_guided(
         interpolate_theta_i=grid.interpolate_theta_i,
         standard_error=jnp.asarray(error),
         field=fit.field,
+        needed=None if needs.node[theta_i].all() else needs.node[theta_i],
     )
 
 
-def read_nodes(field: GuidedField, grid: Grid, whiten: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the field and its standard error [theta_i, theta_o, phi_o inclusive, wavelength] at the grid's nodes.
-
-    The field is even in azimuth, so half of the circle is evaluated.
-
-    Args:
-        field: The fitted field.
-        grid: Nodes.
-        whiten: Inverse Cholesky factor of prior plus noise, from the fit.
-    """
-    distinct = np.append(grid.azimuth_index, 0)
-    theta_o, phi_o = (a.reshape(-1) for a in np.meshgrid(grid.theta_o, grid.phi_o[: grid.num_azimuths], indexing="ij"))
-    shape = (len(grid.theta_i), len(grid.theta_o), len(distinct), len(field.wavelength_nm))
-    value, error = np.empty(shape), np.empty(shape)
-    for place, theta_i in enumerate(grid.theta_i):
-        angles = (jnp.asarray(a) for a in (np.full_like(theta_o, theta_i), theta_o, phi_o))
-        found = evaluate_with_error(field, jnp.asarray(whiten), *angles)
-        for whole, part in zip((value, error), found, strict=False):  # the noise of one measurement is not kept
-            whole[place] = np.asarray(part).reshape(shape[1], -1, shape[3])[:, distinct]
-    return value, error
+def fit_of(gridded: GriddedBRDF, whiten: np.ndarray) -> GuidedFit:
+    """Return the fit behind a grid: the wavelengths at which it ended as it should."""
+    proof = (np.asarray(gridded.kkt_residual), np.asarray(gridded.num_steps), np.asarray(gridded.status))
+    fit = GuidedFit(gridded.field, *proof, whiten)
+    return take_fit(fit, np.asarray(gridded.status) == int(Status.OK))
 
 
 def describe_fit(field: GuidedField) -> tuple[str, ...]:
@@ -154,21 +194,6 @@ def describe_spike(field: GuidedField) -> list[str]:
     ]
 
 
-def _spread(array: np.ndarray, live: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    """Put an array [..., live wavelength] among all wavelengths."""
-    whole = np.broadcast_to(missing, (*array.shape[:-1], len(live))).copy()
-    whole[..., live] = array
-    return whole
-
-
-def _with_dead_wavelengths(
-    field: GuidedField, wavelength_nm: np.ndarray, live: np.ndarray, missing: np.ndarray
-) -> GuidedField:
-    """Return the field with all wavelengths: 0 where nothing was seen, nan where a value was not finite."""
-    if live.all():
-        return field
-    per_wavelength = ("half", "azimuth", "multiplier", "model_residual")
-    parts = {name: jnp.asarray(_spread(np.asarray(getattr(field, name)), live, missing)) for name in per_wavelength}
-    amplitude = _spread(np.asarray(field.lobe.log_amplitude), live, np.full(len(live), -np.inf))
-    lobe = dataclasses.replace(field.lobe, log_amplitude=jnp.asarray(amplitude))
-    return dataclasses.replace(field, wavelength_nm=jnp.asarray(wavelength_nm), lobe=lobe, **parts)
+def _live(samples: RawSamples) -> np.ndarray:
+    """Mask of the wavelengths that are finite and hold a positive value."""
+    return np.isfinite(samples.value).all(axis=0) & (samples.value > 0).any(axis=0)

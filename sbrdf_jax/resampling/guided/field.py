@@ -27,6 +27,15 @@ DIRECTIONS_AT_A_TIME = 1024
 
 
 @pytree()
+class MeasuredLobe:
+    """The lobe model at all measured wavelengths: with it a later run can solve those that this one skipped."""
+
+    wavelength_nm: Any  # [measured]
+    log_amplitude: Any  # [4, measured]
+    model_residual: Any  # [measured]
+
+
+@pytree()
 class GuidedField:
     """All that evaluates the resampled field and its standard error at any direction.
 
@@ -50,6 +59,7 @@ class GuidedField:
     model_residual: Any  # [wavelength] relative gradient norm of the lobe model's fit
     reciprocity_cost: Any  # left-out errors with nodes tied by reciprocity over those without; 1 where not tied
     curve: Any  # [2, trial] noise and left-out error of z
+    measured: MeasuredLobe
 
 
 @jax.jit

@@ -1,19 +1,22 @@
-"""What depends on the angles of a measurement alone, kept for the next measurement at the same angles."""
+"""What one run works out and the next may use: what depends on angles alone, and what a whole measurement says."""
 
 import hashlib
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
 
 from sbrdf_jax.multipliers import InverseNormal, invert_normal
+from sbrdf_jax.options import ResampleOptions
 from sbrdf_jax.records import RawSamples
-from sbrdf_jax.resampling.guided.centres import Centres, place_centres
+from sbrdf_jax.resampling.guided import Centres, Estimates, GuidedField, estimate_whole, place_centres
+from sbrdf_jax.resampling.guided.estimates import restore_estimates
 from sbrdf_jax.resampling.normal import TiedGridNormal
 
 
-class Geometry:
-    """The last geometry of each method: materials of one geometry, one after the other, work it out once.
+class Kept:
+    """The last geometry and the last measurement: materials of one geometry, and scenes of one material.
 
     Numerics:
         What is kept is what would be computed again, to the last bit.
@@ -23,6 +26,7 @@ class Geometry:
         """Begin with none."""
         self._inverse: tuple[str, InverseNormal | None] = "", None
         self._centres: tuple[str, Centres | None] = "", None
+        self._estimates: tuple[str, Estimates | None] = "", None
 
     def inverse(self, operator: TiedGridNormal) -> InverseNormal | None:
         """`multipliers.invert_normal`, for method paper."""
@@ -39,6 +43,27 @@ class Geometry:
         if found is None or self._centres[0] != key:
             found = place_centres(samples, reciprocal)
             self._centres = key, found
+        return found
+
+    def estimates(
+        self,
+        samples: RawSamples,
+        options: ResampleOptions,
+        centres: Centres,
+        report: Callable[[str], None] | None = None,
+        stored: GuidedField | None = None,
+    ) -> Estimates:
+        """`guided.estimate_whole` for the next scene of the same material, or what `stored`, its field, holds of it."""
+        setting = np.array([str(options.smoothness_weight), str(centres.reciprocal)])
+        key = _key([samples.row, samples.theta_i, samples.theta_o, samples.phi_o, samples.value, setting])
+        found = self._estimates[1]
+        if found is None or self._estimates[0] != key:
+            self._estimates = "", None  # before the next are made: their matrices take 34 MB
+            if stored is None:
+                found = estimate_whole(samples, options, centres, report)
+            else:
+                found = restore_estimates(stored, samples, centres)
+            self._estimates = key, found
         return found
 
 

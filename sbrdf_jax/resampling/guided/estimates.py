@@ -1,0 +1,169 @@
+"""What a whole measurement says before any wavelength is solved: floor, lobe model, smoothness, trust, error scale.
+
+It is the same whatever a scene needs of the measurement, and is kept for its next scene.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from sbrdf_jax.angles import fold_azimuth
+from sbrdf_jax.records import RawSamples
+from sbrdf_jax.resampling.guided.centres import Centres
+from sbrdf_jax.resampling.guided.coordinates import from_log, guided_coordinates, log_scale, slope, to_log
+from sbrdf_jax.resampling.guided.error_model import (
+    ResidualScale,
+    estimate_floor,
+    fit_residual_scale,
+    noise_factors,
+    spread_rows,
+)
+from sbrdf_jax.resampling.guided.field import GuidedField
+from sbrdf_jax.resampling.guided.inverse import leave_group_out, lower_product, mirror_lower, whitener
+from sbrdf_jax.resampling.guided.lobe_model import LobeModel, density_weights, fit_lobe_model, lobe_log_value
+from sbrdf_jax.resampling.guided.nodes import ModeVariance
+from sbrdf_jax.resampling.guided.smoothing import choose_smoothing
+
+CALIBRATION_GROUPS = 5
+
+
+class Estimates(NamedTuple):
+    """Estimates from all wavelengths, and the linear problem that they leave for each."""
+
+    wavelength_nm: np.ndarray  # [wavelength] all that hold a positive value and are finite
+    floor: float  # 1/sr
+    lobe: LobeModel
+    model_residual: Any  # [wavelength] relative gradient norm of the lobe model's fit
+    variance: ModeVariance
+    noise_level: float  # variance of z of one sample, relative to the prior's
+    factor: np.ndarray  # [centre] noise variance relative to the neighbours'
+    noise: np.ndarray  # [centre] variance of z relative to the prior's
+    curve: tuple[tuple[float, float], ...]
+    reciprocity_cost: float
+    scale: ResidualScale
+    whiten: np.ndarray  # [centre, centre] inverse Cholesky factor of prior plus noise
+    inverse: np.ndarray  # [centre, centre] of prior plus noise
+    residual: np.ndarray  # [centre, wavelength] z minus the lobe model's
+    model: np.ndarray  # [centre, wavelength] z of the lobe model
+
+
+def estimate(
+    samples: RawSamples, weight: float | None, centres: Centres, report: Callable[[str], None] | None = None
+) -> Estimates:
+    """Estimate all that depends on the whole measurement.
+
+    Args:
+        samples: Measurement of a bilateral material; every value is finite, every wavelength has a positive one.
+        weight: Noise variance of z relative to the prior's; None: chosen by left-out errors.
+        centres: Where the samples are.
+        report: Told of each step.
+    """
+    say = report or (lambda _: None)
+    seen = centres.number > 0
+    floor = estimate_floor(samples.theta_i, samples.theta_o, fold_azimuth(samples.phi_o), samples.value)
+    z_sample, at_samples = _sample_logarithm(samples, floor, centres)
+    z = centres.mean(z_sample)
+
+    say("lobe model")
+    half = np.asarray(centres.at.half)
+    density = np.zeros(centres.count)
+    density[seen] = density_weights(half[seen])
+    lobe, model_residual = fit_lobe_model(centres.mean(np.maximum(samples.value, 0.0)), z, centres.at, density, floor)
+    residual, model = _split(centres, z_sample, at_samples, lobe, floor)
+
+    say("smoothness")
+    choice = choose_smoothing(centres, residual, weight)
+    factor = np.ones(centres.count)
+    factor[seen] = noise_factors(half[seen], *centres.angles[:2, seen], choice.left_out[seen])
+    noise = centres.noise(choice.noise) * factor
+    whiten = whitener(np.asarray(centres.prior(choice.variance)), noise)
+    lower = lower_product(whiten)
+    inverse = mirror_lower(lower)
+
+    say("error scale")
+    out, variance = _left_out_fifths(seen, lower, inverse @ residual)
+    # a centre's own extra noise, or what averaging took from it, is not that of a new measurement
+    spread = np.maximum(variance - noise, 0.0) + choice.noise
+    return Estimates(
+        wavelength_nm=samples.wavelength_nm,
+        floor=floor,
+        lobe=lobe,
+        model_residual=model_residual,
+        variance=choice.variance,
+        noise_level=choice.noise,
+        factor=factor,
+        noise=noise,
+        curve=choice.curve,
+        reciprocity_cost=choice.reciprocity_cost,
+        scale=_calibrate(centres, samples, model + residual - out, spread, floor),
+        whiten=whiten,
+        inverse=inverse,
+        residual=residual,
+        model=model,
+    )
+
+
+def _sample_logarithm(samples: RawSamples, floor: float, centres: Centres):
+    """Return the generalised logarithm of the samples [sample, wavelength], and their coordinates."""
+    angles = (jnp.asarray(a) for a in (samples.theta_i, samples.theta_o, samples.phi_o, centres.theta_limit))
+    at = guided_coordinates(*angles)
+    return np.asarray(to_log(jnp.asarray(samples.value), log_scale(at, jnp.asarray(floor)))), at
+
+
+def _split(centres: Centres, z_sample: np.ndarray, at_samples, lobe: LobeModel, floor: float):
+    """Return what the lobe model leaves at the centres, and what it says there [centre, wavelength]."""
+    level = jnp.asarray(floor)
+    residual = centres.mean(z_sample - np.asarray(lobe_log_value(lobe, at_samples, level)))
+    seen = (centres.number > 0)[:, None]
+    return residual, np.where(seen, np.asarray(lobe_log_value(lobe, centres.at, level)), 0.0)
+
+
+def _left_out_fifths(seen: np.ndarray, lower: np.ndarray, dual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Exact residuals of leaving random fifths out, and their variances."""
+    group = np.random.default_rng(0).permutation(len(seen)) % CALIBRATION_GROUPS
+    return leave_group_out(lower, dual, np.where(seen, group, -1))
+
+
+def _calibrate(centres: Centres, samples: RawSamples, predicted, spread, floor: float) -> ResidualScale:
+    """Calibrate the error scale by how far samples lie from predictions that did not see them."""
+    rows = spread_rows(samples.num_samples)
+    centre = centres.index[rows]
+    z = predicted[centre]
+    scale = log_scale(centres.at, jnp.asarray(floor))[centre]
+    value, unit = (np.asarray(f(jnp.asarray(z), scale)) for f in (from_log, slope))
+    standardised = (np.maximum(samples.value[rows], 0.0) - value) / (unit * np.sqrt(spread[centre])[:, None])
+    return fit_residual_scale(centres.angles[0, centre], np.asarray(centres.at.half)[centre], z, standardised)
+
+
+def restore_estimates(field: GuidedField, samples: RawSamples, centres: Centres) -> Estimates:
+    """Return the estimates that a stored field was solved from, at the cost of one factorisation.
+
+    Args:
+        field: Of an earlier run on the same samples, at whatever wavelengths.
+        samples: As for `estimate`.
+        centres: Where the samples are.
+    """
+    floor = float(field.floor)
+    lobe = LobeModel(jnp.asarray(field.lobe.shape), jnp.asarray(field.measured.log_amplitude))
+    residual, model = _split(centres, *_sample_logarithm(samples, floor, centres), lobe, floor)
+    noise = np.asarray(field.noise).reshape(-1)
+    whiten = whitener(np.asarray(centres.prior(field.variance)), noise)
+    return Estimates(
+        wavelength_nm=np.asarray(field.measured.wavelength_nm),
+        floor=floor,
+        lobe=lobe,
+        model_residual=np.asarray(field.measured.model_residual),
+        variance=field.variance,
+        noise_level=float(field.noise_level),
+        factor=np.asarray(field.noise_factor).reshape(-1),
+        noise=noise,
+        curve=tuple(map(tuple, np.asarray(field.curve).T)),
+        reciprocity_cost=float(field.reciprocity_cost),
+        scale=field.scale,
+        whiten=whiten,
+        inverse=mirror_lower(lower_product(whiten)),
+        residual=residual,
+        model=model,
+    )
