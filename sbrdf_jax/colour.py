@@ -60,10 +60,12 @@ def colour_matching(
         The weights, with a note where the wavelengths do not cover 380 to 780 nm.
 
     Raises:
-        ValueError: the observer is unknown.
+        ValueError: the observer or the illuminant is unknown.
     """
     if observer not in OBSERVERS:
         raise ValueError(f"observer {observer!r} is unknown; it is {' or '.join(OBSERVERS)}")
+    if illuminant not in illuminants():
+        raise ValueError(f"illuminant {illuminant!r} is unknown; it is one of {', '.join(illuminants())}")
     wavelength = np.asarray(wavelength_nm, float)
     note = coverage_note(wavelength)
     if wavelength[-1] < VISIBLE_NM[0] or wavelength[0] > VISIBLE_NM[1]:
@@ -75,6 +77,13 @@ def colour_matching(
     else:
         weight = _weights_by_interpolation(wavelength, tables)
     return ColourMatching(wavelength, weight, weight.sum(0), note)
+
+
+def illuminants() -> tuple[str, ...]:
+    """Names of the illuminants that colour-science knows."""
+    import colour
+
+    return tuple(colour.SDS_ILLUMINANTS)
 
 
 def coverage_note(wavelength_nm: np.ndarray) -> str:
@@ -104,9 +113,13 @@ def xyz_to_lab(xyz: np.ndarray, matching: ColourMatching) -> np.ndarray:
 
 def delta_e_2000(brdf_a: np.ndarray, brdf_b: np.ndarray, matching: ColourMatching) -> np.ndarray:
     """Colour difference CIE Delta E 2000 [...] between BRDF spectra [..., wavelength] in 1/sr."""
+    return lab_difference(*(xyz_to_lab(brdf_to_xyz(brdf, matching), matching) for brdf in (brdf_a, brdf_b)))
+
+
+def lab_difference(lab_a: np.ndarray, lab_b: np.ndarray) -> np.ndarray:
+    """Colour difference CIE Delta E 2000 [...] between CIE 1976 L*a*b* [..., 3]."""
     import colour
 
-    lab_a, lab_b = (xyz_to_lab(brdf_to_xyz(brdf, matching), matching) for brdf in (brdf_a, brdf_b))
     return np.asarray(colour.delta_E(lab_a, lab_b, method="CIE 2000"))
 
 

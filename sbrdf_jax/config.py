@@ -23,9 +23,7 @@ NOT_YET: dict[str, tuple[Callable[[Any], bool], str]] = {
         "auto, pbrt, csv, hdf5, nist",
     ),
     "represent.method": (lambda value: value == "lobe_harmonics", "auto, paper, lobe_tensor"),
-    "scene": (lambda value: value is not None, "null"),
     "runtime.precision": (lambda value: value == "float32", "float64"),
-    "runtime.resume_from": (lambda value: value is not None, "null"),
 }
 
 # What auto means, by method; what is not here stays auto and is decided by the data.

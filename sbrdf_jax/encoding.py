@@ -230,7 +230,9 @@ def decode(
 
 
 def encode_field(gridded: GriddedBRDF, basis: SpectralBasis) -> SpectralField:
-    """Return the coefficients at every node of the grid."""
+    """Return the coefficients at every node of the grid; between incident angles only where their step is uniform."""
+    steps = np.diff(np.asarray(gridded.theta_i))
+    uniform = len(steps) > 0 and bool(np.ptp(steps) <= 1e-9)
     return SpectralField(
         gridded.theta_i,
         gridded.theta_o,
@@ -238,7 +240,7 @@ def encode_field(gridded: GriddedBRDF, basis: SpectralBasis) -> SpectralField:
         encode(gridded.brdf, basis),
         basis,
         window=gridded.window,
-        interpolate_theta_i=gridded.interpolate_theta_i,
+        interpolate_theta_i=gridded.interpolate_theta_i and uniform,
     )
 
 

@@ -9,10 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from sbrdf_jax.cleaning import CleanEntry, CleanReport, Flag
+from sbrdf_jax.colour import ColourMatching
 from sbrdf_jax.compact_layout import read_basis, status_dataset, write_basis
 from sbrdf_jax.coverage import Coverage
 from sbrdf_jax.encoding import coefficient_names
 from sbrdf_jax.hdf5 import attribute, dataset, dataset_of, degrees, read, read_mapping, scale, write_mapping
+from sbrdf_jax.quadrature import Quadrature
 from sbrdf_jax.records import GriddedBRDF, SpectralField
 from sbrdf_jax.resampling.guided.error_model import ResidualScale
 from sbrdf_jax.resampling.guided.field import GuidedField, MeasuredLobe
@@ -48,6 +50,8 @@ def write_grid(group: h5py.Group, gridded: GriddedBRDF) -> None:
     dataset(group, "kkt_residual", gridded.kkt_residual, "1", [axes["wavelength"]])
     dataset(group, "num_steps", np.asarray(gridded.num_steps, np.int64), "1", [axes["wavelength"]])
     status_dataset(group, gridded.status, [axes["wavelength"]])
+    if gridded.needed is not None:
+        dataset(group, "needed", np.asarray(gridded.needed, np.uint8), "1", directions)
     if gridded.standard_error is not None:
         dataset(group, "standard_error", gridded.standard_error, "1/sr", [*directions, axes["wavelength"]])
 
@@ -65,6 +69,27 @@ def write_guided(group: h5py.Group, field: GuidedField) -> None:
     for name, axes in GRIDS.items():
         for axis, label in zip(axes, (name, "theta_i", "theta_o"), strict=True):
             group[name].attrs[f"{label}_nodes"] = axis.nodes
+
+
+def write_quadrature(group: h5py.Group, quadrature: Quadrature, grid: h5py.Group) -> None:
+    """Write the weights of a colour: XYZ is pi times brdf @ weight, Y = 100 for the perfect diffuser."""
+    names = scale(group, "tristimulus", np.arange(3), "1")
+    matching = quadrature.matching
+    dataset(group, "weight", matching.weight, "1", [dataset_of(grid, "wavelength_nm"), names])
+    dataset(group, "white", matching.white, "1", [names])
+    for name in ("observer", "illuminant", "delta_e", "limit"):
+        group.attrs[name] = getattr(quadrature, name)
+    group.attrs["note"] = matching.note
+
+
+def read_quadrature(group: h5py.Group, gridded: GriddedBRDF) -> Quadrature:
+    """Read what `write_quadrature` wrote."""
+    wavelength_nm = np.asarray(gridded.wavelength_nm)
+    note = str(attribute(group, "note"))
+    matching = ColourMatching(wavelength_nm, read(group, "weight", (len(wavelength_nm), 3)), read(group, "white"), note)
+    texts = (str(attribute(group, name)) for name in ("observer", "illuminant"))
+    numbers = (float(attribute(group, name)) for name in ("delta_e", "limit"))
+    return Quadrature(np.arange(len(wavelength_nm)), matching, *texts, *numbers)
 
 
 def write_field(group: h5py.Group, field: SpectralField, grid: h5py.Group) -> None:
@@ -95,15 +120,20 @@ def write_cleaning(group: h5py.Group, report: CleanReport) -> None:
     group.attrs["missing"] = json.dumps(report.coverage.missing)
 
 
-def write_validation(group: h5py.Group, validation: Mapping[str, np.ndarray], grid: h5py.Group) -> None:
+def write_validation(
+    group: h5py.Group, validation: Mapping[str, np.ndarray], grid: h5py.Group, measured_nm: np.ndarray
+) -> None:
     """Write held-out predictions, a row for each input row in file order, and their scores.
 
     Args:
         group: The empty group `validation`.
         validation: Arrays by name; a name with "/" lies in a group of its own.
         grid: The group `grid`, for the wavelengths.
+        measured_nm: The wavelengths that are validated: all, also where a scene needs fewer.
     """
     wavelength = dataset_of(grid, "wavelength_nm")
+    if wavelength.shape != measured_nm.shape:
+        wavelength = scale(group, "wavelength_nm", measured_nm, "nm")
     for name, value in validation.items():
         *parents, last = name.split("/")
         inner = group.require_group("/".join(parents)) if parents else group
@@ -154,6 +184,7 @@ def read_grid(group: h5py.Group, field: h5py.Group | None = None) -> GriddedBRDF
         bilateral=bool(attribute(group, "bilateral")),
         interpolate_theta_i=bool(attribute(group, "interpolate_theta_i")),
         standard_error=read(group, "standard_error", (*directions, *lanes)) if "standard_error" in group else None,
+        needed=read(group, "needed", directions) > 0 if "needed" in group else None,
         field=None if field is None else read_guided(field),
     )
 

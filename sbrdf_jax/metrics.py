@@ -10,7 +10,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from sbrdf_jax import colour
 from sbrdf_jax.angles import angle_between
@@ -19,10 +19,11 @@ from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_on_axes, measured_
 from sbrdf_jax.grid import midpoints
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralBasis, SpectralField
 from sbrdf_jax.representation import lobe_tensor
+from sbrdf_jax.representation.half_field import cells_between
 from sbrdf_jax.representation.paper import compact_coefficient
 from sbrdf_jax.representation.target import PAPER_DIRECTIONS
 
-NUM_RANDOM_DIRECTIONS = 4096
+NUM_RANDOM_DIRECTIONS, RANDOM_PER_THETA_I = 4096, 512
 CHUNK_SIZE = 1024  # one shape for all compact evaluations here: they compile once
 ALBEDO_THETA, ALBEDO_PHI = 48, 96  # fewest quadrature points; two a node on finer grids
 
@@ -49,6 +50,7 @@ def measure(
     compact: CompactBRDF | LobeTensor | None = None,
     *,
     absolute: bool = True,
+    matching: colour.ColourMatching | None = None,
     seed: int = 0,
 ) -> Metrics:
     """Measure the grid, and the compact form against it.
@@ -58,25 +60,31 @@ def measure(
         field: Its spectral coefficients, for the split of the error.
         compact: Its compact form, of the wavelengths that are finite; without it only the grid is measured.
         absolute: False where values are only proportional to a BRDF: albedo then warns of nothing.
+        matching: Colours of the grid's wavelengths, where they are not those of all that was measured.
         seed: Of the random directions.
 
     Returns:
-        The scores of the grid and, where given, of the compact form.
+        The scores of the grid and, where given, of the compact form, over the nodes that are needed; albedos are
+        nan where some of the hemisphere is not.
     """
     value, warnings = measure_grid(gridded, absolute=absolute, seed=seed)
     if compact is not None:
         value |= error_between(compact, gridded) | compression(compact)
-        matching = colour.colour_matching(np.asarray(gridded.wavelength_nm)[live_wavelengths(gridded)])
+        live = live_wavelengths(gridded)
+        if matching is None:
+            matching = colour.colour_matching(np.asarray(gridded.wavelength_nm)[live])
+        else:
+            matching = dataclasses.replace(matching, weight=matching.weight[live])
         value |= error_at_nodes(compact, gridded, matching)
         if matching.note:
             warnings.append(f"colour: {matching.note}")
         if field is not None:
             value |= error_split(compact, field, gridded)
-        share, depth, reciprocity = off_node_scores(compact, seed=seed)
+        share, depth, reciprocity = off_node_scores(compact, seed=seed, needed=needed_nodes(gridded))
         value |= {"negative_share": share, "negative_depth": depth, "reciprocity_error_compact": reciprocity}
-        of_compact = albedo(compact)
+        of_compact = albedo(compact, whole_hemispheres(gridded))
         value["albedo_compact"] = np.full(value["albedo"].shape, np.nan)
-        value["albedo_compact"][:, live_wavelengths(gridded)] = of_compact
+        value["albedo_compact"][:, live] = of_compact
         if absolute:
             warnings += albedo_warnings(of_compact, compact, "compact")
     return Metrics({name: np.asarray(v) for name, v in value.items()}, tuple(warnings))
@@ -84,9 +92,9 @@ def measure(
 
 def measure_grid(gridded: GriddedBRDF, *, absolute: bool = True, seed: int = 0) -> tuple[dict, list[str]]:
     """Albedo, negative values and reciprocity of the grid stage, the share of nodes without data, and warnings."""
-    share, depth, reciprocity = off_node_scores(gridded, seed=seed)
+    share, depth, reciprocity = off_node_scores(gridded, seed=seed, needed=needed_nodes(gridded))
     value = {
-        "albedo": albedo(gridded),
+        "albedo": albedo(gridded, whole_hemispheres(gridded)),
         "negative_share_grid": share,
         "negative_depth_grid": depth,
         "reciprocity_error": reciprocity,
@@ -110,58 +118,92 @@ def relative_deviation(reconstructed: np.ndarray, original: np.ndarray) -> np.nd
 
 
 def error_at_nodes(compact: CompactBRDF | LobeTensor, gridded: GriddedBRDF, matching: colour.ColourMatching) -> dict:
-    """Compare compact form and grid at the grid's nodes: eq. (18), median relative error, Delta E 2000 under D65.
+    """Compare compact form and grid at the grid's nodes: eq. (18), median relative error, Delta E 2000.
 
-    All nodes count, copies at the poles and at 360 degrees included, as the paper counts;
-    wavelengths count where the whole grid is finite, which are those of the compact form.
+    All nodes that are needed count, copies at the poles and at 360 degrees included, as the paper
+    counts; wavelengths count where the whole grid is finite, which are those of the compact form.
     """
-    live = live_wavelengths(gridded)
+    live, needed = live_wavelengths(gridded), needed_nodes(gridded)
+    mesh = np.meshgrid(np.asarray(gridded.theta_o), np.asarray(gridded.phi_o), indexing="ij")
+    counts = needed.any(axis=(1, 2))
     error_energy, energy, deviation, delta_e = [], [], [], []
     for i, theta_i in enumerate(np.asarray(gridded.theta_i)):
-        original = np.asarray(gridded.brdf[i])[..., live]
-        reconstructed = on_axes(compact, theta_i, gridded.theta_o, gridded.phi_o)
+        if not counts[i]:
+            continue
+        original = np.asarray(gridded.brdf[i])[needed[i]][:, live]
+        theta_o, phi_o = (axis[needed[i]] for axis in mesh)
+        angles = np.full(theta_o.shape, theta_i), theta_o, phi_o
+        reconstructed = evaluate_in_chunks(compact, *angles, chunk_size=CHUNK_SIZE)
         error_energy.append(((reconstructed - original) ** 2).sum())
         energy.append((original**2).sum())
         deviation.append(relative_deviation(reconstructed, original).ravel())
-        delta_e.append(colour.delta_e_2000(reconstructed, original, matching).ravel())
+        delta_e.append(colour.delta_e_2000(reconstructed, original, matching))
+    overall = {
+        "relative_error": relative_error(sum(error_energy), sum(energy)),
+        "median_relative_error": np.median(np.concatenate(deviation)),
+        **_delta_e_scores(np.concatenate(delta_e)),
+    }
+    scores = {name: np.full(len(counts), np.nan) for name in overall}
+    scores["relative_error"][counts] = relative_error(error_energy, energy)
+    for row, differences, deviations in zip(np.flatnonzero(counts), delta_e, deviation, strict=True):
+        scores["median_relative_error"][row] = np.median(deviations)
+        for name, value in _delta_e_scores(differences).items():
+            scores[name][row] = value
+    return scores | {f"{name}_overall": value for name, value in overall.items()}
+
+
+def _delta_e_scores(difference: np.ndarray) -> dict:
     return {
-        "relative_error": relative_error(error_energy, energy),
-        "relative_error_overall": relative_error(sum(error_energy), sum(energy)),
-        "median_relative_error": np.median(deviation, axis=1),
-        "median_relative_error_overall": np.median(deviation),
-        "delta_e_median": np.median(delta_e, axis=1),
-        "delta_e_p95": np.quantile(delta_e, 0.95, axis=1),
-        "delta_e_max": np.max(delta_e, axis=1),
-        "delta_e_median_overall": np.median(delta_e),
-        "delta_e_p95_overall": np.quantile(delta_e, 0.95),
-        "delta_e_max_overall": np.max(delta_e),
+        "delta_e_median": np.median(difference),
+        "delta_e_p95": np.quantile(difference, 0.95),
+        "delta_e_max": np.max(difference),
     }
 
 
 def live_wavelengths(gridded: GriddedBRDF) -> np.ndarray:
-    """Mask of the wavelengths at which the whole grid is finite; the others are lanes that failed, and say so."""
-    return np.all(np.isfinite(np.asarray(gridded.brdf)), axis=(0, 1, 2))
+    """Mask of the wavelengths finite at all nodes that are needed; the others are lanes that failed, and say so."""
+    finite = np.isfinite(np.asarray(gridded.brdf))
+    return np.all(finite, axis=(0, 1, 2)) if gridded.needed is None else np.all(finite[gridded.needed], axis=0)
+
+
+def needed_nodes(gridded: GriddedBRDF) -> Bool[np.ndarray, "theta_i theta_o phi_o"]:
+    """Mask of the nodes that were computed."""
+    return np.ones(np.shape(gridded.brdf)[:3], bool) if gridded.needed is None else np.asarray(gridded.needed, bool)
+
+
+def whole_hemispheres(gridded: GriddedBRDF) -> Bool[np.ndarray, " theta_i"]:
+    """Mask of the incident angles whose every node was computed."""
+    return needed_nodes(gridded).all(axis=(1, 2))
 
 
 def error_between(compact: CompactBRDF | LobeTensor, gridded: GriddedBRDF) -> dict:
     """Eq. (18) at cell midpoints of theta_o and phi_o, against the grid stage there; and with theta_i midway too.
 
-    Midway between incident angles it is NaN where the grid interpolates nothing over them.
+    Midpoints count whose neighbours are all needed; it is nan where there are none, and midway between
+    incident angles where the grid interpolates nothing over them.
     """
     theta_i = np.asarray(gridded.theta_i)
     theta_o, phi_o = midpoints(gridded.theta_o), midpoints(gridded.phi_o)
-    live = live_wavelengths(gridded)
+    live, cell = live_wavelengths(gridded), cells_between(needed_nodes(gridded))
+    mesh = np.meshgrid(theta_o, phi_o, indexing="ij")
 
-    def at(incidence):
-        original = on_axes(gridded, incidence, theta_o, phi_o)[..., live]
-        reconstructed = on_axes(compact, incidence, theta_o, phi_o)
+    def at(incidence, cells):
+        if cells.all():
+            original = on_axes(gridded, incidence, theta_o, phi_o)[..., live]
+            reconstructed = on_axes(compact, incidence, theta_o, phi_o)
+        elif cells.any():
+            angles = np.full(int(cells.sum()), incidence), *(axis[cells] for axis in mesh)
+            original = evaluate_in_chunks(gridded, *angles)[..., live]
+            reconstructed = evaluate_in_chunks(compact, *angles, chunk_size=CHUNK_SIZE)
+        else:
+            return np.nan
         return relative_error(((reconstructed - original) ** 2).sum(), (original**2).sum())
 
     midway = midpoints(theta_i)
-    interpolated = gridded.interpolate_theta_i
+    both = cell[:-1] & cell[1:] if gridded.interpolate_theta_i else np.zeros_like(cell[:-1])
     return {
-        "relative_error_between": np.array([at(t) for t in theta_i]),
-        "relative_error_between_theta_i": np.array([at(t) if interpolated else np.nan for t in midway]),
+        "relative_error_between": np.array([at(t, cells) for t, cells in zip(theta_i, cell, strict=True)]),
+        "relative_error_between_theta_i": np.array([at(t, cells) for t, cells in zip(midway, both, strict=True)]),
     }
 
 
@@ -176,7 +218,8 @@ def error_split(compact: CompactBRDF | LobeTensor, field: SpectralField, gridded
     """
     live = live_wavelengths(gridded)
     if isinstance(compact, LobeTensor):
-        return {"error_spectral": truncation_error(compact.basis, np.asarray(gridded.brdf)[..., live])}
+        brdf = np.where(needed_nodes(gridded)[..., None], np.asarray(gridded.brdf), 0.0)
+        return {"error_spectral": truncation_error(compact.basis, brdf[..., live])}
     parts = {"error_spectral": [], "error_background": [], "error_lobe": []}
     for i in range(len(gridded.theta_i)):
         original = np.asarray(gridded.brdf[i])[..., live]
@@ -243,14 +286,22 @@ def compression(compact: CompactBRDF | LobeTensor) -> dict:
     return everything | {"compression_ratio_paper": grid / ((num_harmonics + 2) * num_coefficients)}
 
 
-def off_node_scores(result, *, seed: int = 0) -> tuple[float, float, float]:
+def off_node_scores(
+    result, *, seed: int = 0, needed: Bool[np.ndarray, "theta_i theta_o phi_o"] | None = None
+) -> tuple[float, float, float]:
     """Share of negative values, depth of the deepest [1/sr, positive] and reciprocity error at random directions.
 
     The reciprocity error is the relative RMS difference of f(i, o) and f(o, i); exchanged
     directions have the azimuth -phi_o. Pairs beyond the incident angles of the result do not
-    count; it is NaN where nothing is interpolated over theta_i.
+    count; it is NaN where nothing is interpolated over theta_i, or where some nodes are not needed: then directions
+    near those that are needed count.
     """
     theta_i, theta_o, phi_o = random_directions(result, seed)
+    if needed is not None and not needed.all():
+        near = _near_needed(np.asarray(result.theta_i), needed, theta_i, theta_o, phi_o)
+        forward = evaluate_in_chunks(result, theta_i[near], theta_o[near], phi_o[near], chunk_size=CHUNK_SIZE)
+        below = np.where(forward < 0, -forward, 0.0)
+        return float((forward < 0).mean()) if near.any() else 0.0, float(below.max(initial=0.0)), float("nan")
     forward = evaluate_in_chunks(result, theta_i, theta_o, phi_o, chunk_size=CHUNK_SIZE)
     share, depth = float((forward < 0).mean()), float(np.where(forward < 0, -forward, 0.0).max())
     if not result.interpolate_theta_i:
@@ -262,18 +313,27 @@ def off_node_scores(result, *, seed: int = 0) -> tuple[float, float, float]:
     return share, depth, float(relative_error(((forward[live] - backward[live]) ** 2).sum(), energy))
 
 
+def _near_needed(nodes_i, needed, theta_i, theta_o, phi_o) -> Bool[np.ndarray, " direction"]:
+    """Mask of the directions whose nearest node is needed."""
+    _, num_o, num_phi = needed.shape
+    row = np.argmin(np.abs(theta_i[:, None] - nodes_i), axis=1)
+    place_o = np.rint(theta_o / (np.pi / 2) * (num_o - 1)).astype(int)
+    return needed[row, place_o, np.rint(phi_o / (2 * np.pi) * (num_phi - 1)).astype(int)]
+
+
 def random_directions(result, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Seeded random directions [rad]: theta_i even in angle (or on its nodes), exitance even over the hemisphere."""
     rng = np.random.default_rng(seed)
     nodes = np.asarray(result.theta_i)
-    theta_i = rng.uniform(nodes[0], nodes[-1], NUM_RANDOM_DIRECTIONS)
+    count = min(NUM_RANDOM_DIRECTIONS, RANDOM_PER_THETA_I * len(nodes))
+    theta_i = rng.uniform(nodes[0], nodes[-1], count)
     if not result.interpolate_theta_i:
-        theta_i = nodes[rng.integers(len(nodes), size=NUM_RANDOM_DIRECTIONS)]
-    theta_o = np.arccos(rng.uniform(0.0, 1.0, NUM_RANDOM_DIRECTIONS))
-    return theta_i, theta_o, rng.uniform(0.0, 2 * np.pi, NUM_RANDOM_DIRECTIONS)
+        theta_i = nodes[rng.integers(len(nodes), size=count)]
+    theta_o = np.arccos(rng.uniform(0.0, 1.0, count))
+    return theta_i, theta_o, rng.uniform(0.0, 2 * np.pi, count)
 
 
-def albedo(result) -> Float[np.ndarray, "theta_i wavelength"]:
+def albedo(result, whole: Bool[np.ndarray, " theta_i"] | None = None) -> Float[np.ndarray, "theta_i wavelength"]:
     """Directional-hemispherical reflectance at each incident angle of a result: the integral of f cos(theta_o).
 
     Gauss-Legendre in theta_o (48 points or two a node) times the midpoint rule in phi_o (96
@@ -287,8 +347,13 @@ def albedo(result) -> Float[np.ndarray, "theta_i wavelength"]:
     theta_o = (point + 1) * np.pi / 4
     weight = weight * np.pi / 4 * np.cos(theta_o) * np.sin(theta_o)
     phi_o = (np.arange(num_phi) + 0.5) * (2 * np.pi / num_phi)
-    rows = [weight @ on_axes(result, t, theta_o, phi_o).sum(axis=1) for t in np.asarray(result.theta_i)]
-    return np.stack(rows) * (2 * np.pi / num_phi)
+    if isinstance(result, LobeTensor) or getattr(result, "bilateral", False):
+        phi_o = phi_o[: (num_phi + 1) // 2]  # the other half is its mirror image
+    nodes = np.asarray(result.theta_i)
+    rows = np.full((len(nodes), np.size(measured_wavelengths(result))), np.nan)
+    for i in np.arange(len(nodes)) if whole is None else np.flatnonzero(whole):
+        rows[i] = weight @ on_axes(result, nodes[i], theta_o, phi_o).sum(axis=1)
+    return rows * (2 * np.pi / len(phi_o))
 
 
 def albedo_warnings(albedo: np.ndarray, result, stage: str) -> list[str]:

@@ -10,16 +10,20 @@ from sbrdf_jax.cleaning import CleanResult, clean
 from sbrdf_jax.encoding import coefficients_allowed, data_basis, encode_field, make_basis
 from sbrdf_jax.folds import LEAVE_ONE_OUT, Folds, make_folds
 from sbrdf_jax.grid import Grid, has_data, make_grid
-from sbrdf_jax.metrics import live_wavelengths, measure
+from sbrdf_jax.metrics import live_wavelengths, measure, needed_nodes
+from sbrdf_jax.needs import Needs
 from sbrdf_jax.options import EncodeOptions, RunOptions
-from sbrdf_jax.plan import PlanRow, plan_run, plan_validation
+from sbrdf_jax.plan import PlanRow, describe_needs, plan_run, plan_validation
 from sbrdf_jax.progress import Progress, StageClock
-from sbrdf_jax.records import STATUS_TEXT, GriddedBRDF, RawSamples, SpectralBasis, Status
+from sbrdf_jax.quadrature import Quadrature, choose_quadrature
+from sbrdf_jax.records import STATUS_TEXT, GriddedBRDF, RawSamples, SpectralBasis, SpectralField, Status
 from sbrdf_jax.representation import represent_with_plan
 from sbrdf_jax.resampling import resample
 from sbrdf_jax.resampling.guided import describe_fit
 from sbrdf_jax.resampling.kept import Kept
+from sbrdf_jax.reuse import Earlier, is_whole_answer, part_of, read_earlier, usable_grid
 from sbrdf_jax.runtime import compile_clock
+from sbrdf_jax.scene import find_needs, restrict_wavelengths
 from sbrdf_jax.store import RunResult
 from sbrdf_jax.summary import count_statuses
 from sbrdf_jax.validation import validate
@@ -36,6 +40,9 @@ class Prepared:
     rows: list[PlanRow]
     warnings: tuple[str, ...]
     folds: Mapping[str, Folds]  # by scheme; empty where validation is off
+    needs: Needs  # what the scene needs of the measurement and the grid
+    quadrature: Quadrature | None = None  # where the scene needs colours alone
+    earlier: Earlier | None = None  # a result whose parts may be reused
 
 
 def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
@@ -53,15 +60,26 @@ def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
     """
     cleaned = clean(raw, bilateral=options.input.bilateral, method=options.resample.method)
     grid = make_grid(cleaned.samples, options.grid, bilateral=cleaned.report.bilateral)
-    num_live = len(raw.wavelength_nm) - len(cleaned.report.dead_wavelength_nm)
+    needs, quadrature = find_needs(options, grid, raw.wavelength_nm), None
+    if options.scene is not None and options.scene.colour is not None:
+        place = np.flatnonzero(needs.wavelength)
+        quadrature = choose_quadrature(raw.wavelength_nm[place], cleaned.samples.value[:, place], options.scene)
+        needs = restrict_wavelengths(needs, np.isin(np.arange(len(needs.wavelength)), place[quadrature.index]))
+    earlier = None if options.runtime.resume_from is None else read_earlier(options.runtime.resume_from)
+    dead = np.isin(raw.wavelength_nm, cleaned.report.dead_wavelength_nm)
+    num_live = int(np.sum(needs.wavelength & ~dead))
     allowed = coefficients_allowed(num_live, int(options.encode.coefficients), options.encode.basis)
-    rows = plan_run(cleaned.samples, raw.num_samples, grid, allowed.coefficients, options)
+    rows = plan_run(cleaned.samples, raw.num_samples, grid, allowed.coefficients, options, needs)
     folds = make_folds(raw, cleaned.report, options.validate, mirror_twins=options.input.bilateral is not False)
     rows += plan_validation(folds)
     warnings = [f"not measured: {text}" for text in cleaned.report.coverage.missing]
     if allowed.warning:
         warnings.append(allowed.warning)
-    return Prepared(cleaned, grid, rows, tuple(warnings), folds)
+    if earlier is not None and usable_grid(earlier, raw, options) is None:
+        reason = "another source, other versions or other options of input, grid or resample"
+        warnings.append(f"runtime.resume_from: {options.runtime.resume_from}: nothing of it is used: {reason}")
+        earlier = None
+    return Prepared(cleaned, grid, rows, tuple(warnings), folds, needs, quadrature, earlier)
 
 
 def process(
@@ -79,16 +97,20 @@ def process(
     Returns:
         The result, but for what only its caller knows: config text, time of creation, versions.
     """
+    if ready.earlier is not None and is_whole_answer(ready.earlier, raw, options):
+        progress.say(f"{options.runtime.resume_from} holds all of this: nothing is computed")
+        return dataclasses.replace(ready.earlier.result, timing={})
     timing: dict[str, dict[str, float]] = {}
-    samples, report = ready.cleaned.samples, ready.cleaned.report
+    samples, report, needs = ready.cleaned.samples, ready.cleaned.report, ready.needs
+    known = None if ready.earlier is None else usable_grid(ready.earlier, raw, options)
     with _timed(progress, timing, "resample"):
-        gridded = resample(
-            samples,
-            ready.grid,
-            options.resample,
-            progress.update,
-            kept,
-        )
+        gridded = None if known is None else part_of(known, ready.grid, needs, samples.wavelength_nm)
+        if gridded is None:
+            gridded = resample(samples, ready.grid, options.resample, progress.update, kept, needs, known)
+        else:
+            progress.update(f"taken from {options.runtime.resume_from}")
+        if gridded.field is None and not needs.node.all():
+            gridded = dataclasses.replace(gridded, needed=needs.node)
     notes = () if gridded.field is None else describe_fit(gridded.field)
 
     live = finite_part(gridded)
@@ -98,13 +120,16 @@ def process(
         used = np.shape(field.coefficient)[-1]
         progress.update(f"{used} coefficients, basis {basis.kind}")
 
+    matching = None if ready.quadrature is None else ready.quadrature.matching
     with _timed(progress, timing, "represent"):
-        compact, searched = represent_with_plan(field, options.represent, live)
+        part, live = restrict_theta_i(field, live, ready.grid.theta_i[needs.theta_i])
+        budget = None if options.scene is None else options.scene.error_budget
+        compact, searched = represent_with_plan(part, options.represent, live, matching, budget)
         missed = tuple(searched.pop("warnings", ()))
         progress.update(count_statuses(compact.status))
 
     with _timed(progress, timing, "measure"):
-        metrics = measure(gridded, field, compact, absolute=raw.quantity == "brdf")
+        metrics = measure(gridded, field, compact, absolute=raw.quantity == "brdf", matching=matching)
 
     validation = {}
     if ready.folds:
@@ -130,11 +155,31 @@ def process(
             "needed": {f"{row.stage} {row.what}": dataclasses.asdict(row) for row in ready.rows},
             "represent": searched,
             "coefficients_used": used,
+            "scene": describe_needs(needs, raw.wavelength_nm, gridded),
         },
         timing=timing,
         warnings=ready.warnings + notes + missed + metrics.warnings,
         source_sha256=raw.source_sha256,
+        quadrature=ready.quadrature,
     )
+
+
+def restrict_theta_i(
+    field: SpectralField, gridded: GriddedBRDF, theta_i: np.ndarray
+) -> tuple[SpectralField, GriddedBRDF]:
+    """Return what the compact form is made of: the incident angles [rad] that are needed, of a grid that has more."""
+    rows = np.isin(np.asarray(gridded.theta_i), theta_i)
+    if rows.all():
+        return field, gridded
+    part = dataclasses.replace(
+        gridded,
+        theta_i=np.asarray(gridded.theta_i)[rows],
+        brdf=np.asarray(gridded.brdf)[rows],
+        extrapolated=np.asarray(gridded.extrapolated)[rows],
+        needed=None,
+    )
+    coefficient = np.asarray(field.coefficient)[rows]
+    return dataclasses.replace(field, theta_i=part.theta_i, coefficient=coefficient), part
 
 
 def spectral_basis(gridded: GriddedBRDF, options: EncodeOptions) -> SpectralBasis:
@@ -144,7 +189,7 @@ def spectral_basis(gridded: GriddedBRDF, options: EncodeOptions) -> SpectralBasi
     if allowed.kind != "data":
         return make_basis(wavelength_nm, allowed.kind, wanted)
     known = has_data(gridded)
-    brdf = np.asarray(gridded.brdf)
+    brdf = np.where(needed_nodes(gridded)[..., None], np.asarray(gridded.brdf), 0.0)
     return data_basis(wavelength_nm, brdf[known] if known.any() else brdf, allowed.coefficients)
 
 
@@ -184,7 +229,7 @@ def _lane_name(result: RunResult, stage: str, index: np.ndarray) -> str:
     if stage == "resample":
         return f"{np.asarray(result.gridded.wavelength_nm)[index[0]]:g} nm"
     if stage.startswith("validate"):
-        return f"fit {index[0] + 1}, {np.asarray(result.gridded.wavelength_nm)[index[1]]:g} nm"
+        return f"fit {index[0] + 1}, {result.measured_nm[index[1]]:g} nm"
     theta_i = f"theta_i {np.rad2deg(np.asarray(result.gridded.theta_i)[index[0]]):g} degrees"
     return theta_i if len(index) == 1 else f"{theta_i}, coefficient {index[1]}"
 

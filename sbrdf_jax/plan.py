@@ -2,13 +2,18 @@
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
 
 from sbrdf_jax.folds import Folds
 from sbrdf_jax.grid import Grid
+from sbrdf_jax.needs import Needs
 from sbrdf_jax.options import RunOptions
-from sbrdf_jax.records import RawSamples
+from sbrdf_jax.records import GriddedBRDF, RawSamples
 
 CRITICAL_ANGLES = 21
+EQUAL = {"guided": 1e-9, "paper": 1e-6}  # see `describe_needs`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +27,9 @@ class PlanRow:
     reason: str
 
 
-def plan_run(kept: RawSamples, num_read: int, grid: Grid, coefficients: int, options: RunOptions) -> list[PlanRow]:
+def plan_run(
+    kept: RawSamples, num_read: int, grid: Grid, coefficients: int, options: RunOptions, needs: Needs
+) -> list[PlanRow]:
     """Count what each stage needs of what there is.
 
     Args:
@@ -31,38 +38,60 @@ def plan_run(kept: RawSamples, num_read: int, grid: Grid, coefficients: int, opt
         grid: The grid to fill.
         coefficients: Real coefficients per spectrum.
         options: Resolved options.
+        needs: What the scene needs.
 
     Returns:
         A row per stage; the represent stage is an upper limit, since the data decide which lanes need a lobe.
     """
-    wavelengths = len(kept.wavelength_nm)
+    wavelengths, needed = len(kept.wavelength_nm), int(needs.wavelength.sum())
     nodes = len(grid.theta_i) * len(grid.theta_o) * (grid.num_phi_o + 1)
-    lanes = len(grid.theta_i) * coefficients
+    angles, needed_angles = len(grid.theta_i), int(needs.theta_i.sum())
     kinds = 3 if options.represent.lobe == "best" else 1
     folded = "phi_o folded, poles tied" if grid.bilateral else "poles tied, 360 degrees = 0"
-    solved = PlanRow("resample", "unknowns", grid.num_unknowns, nodes, folded)
+    scene = "no scene: every one" if options.scene is None else "the scene's"
+    solved = PlanRow("resample", "unknowns", grid.num_unknowns, nodes, folded + "; coupled, all solved")
     if options.resample.method == "guided":
-        distinct = len(grid.theta_i) * len(grid.theta_o) * grid.num_azimuths
-        solved = PlanRow("resample", "nodes", distinct, nodes, "phi_o folded; read off the fitted field")
-    represent = [PlanRow("represent", "lanes", len(grid.theta_i), len(grid.theta_i), "incident angles, all at once")]
+        distinct = int(needs.node[:, :, : grid.num_azimuths].sum())
+        solved = PlanRow("resample", "nodes", distinct, nodes, f"{scene}; phi_o folded; read off the fitted field")
+    represent = [PlanRow("represent", "lanes", needed_angles, angles, "incident angles, all at once")]
     if options.represent.method == "paper":
+        lanes, every = needed_angles * coefficients, angles * coefficients
         represent = [
-            PlanRow("represent", "lanes", lanes, lanes, "incident angles x coefficients"),
+            PlanRow("represent", "lanes", lanes, every, f"incident angles ({scene}) x coefficients"),
             PlanRow(
                 "represent",
                 "lobe fits, at most",
                 lanes * CRITICAL_ANGLES * kinds,
-                lanes * CRITICAL_ANGLES * 3,
+                every * CRITICAL_ANGLES * 3,
                 "lanes that the background explains are skipped",
             ),
         ]
+    colour = options.scene is not None and options.scene.colour is not None
+    chosen = "those that a colour needs" if colour else scene
     return [
         PlanRow("clean", "samples", kept.num_samples, num_read, "what is dropped is listed by reason"),
+        PlanRow("estimate", "samples", kept.num_samples, kept.num_samples, "noise, lobes, smoothness: of the whole"),
         solved,
-        PlanRow("resample", "wavelengths", wavelengths, wavelengths, "no scene: every wavelength"),
-        PlanRow("encode", "coefficients", coefficients, wavelengths, f"basis {options.encode.basis}"),
+        PlanRow("resample", "wavelengths", needed, wavelengths, chosen),
+        PlanRow("encode", "coefficients", coefficients, needed, f"basis {options.encode.basis}"),
         *represent,
     ]
+
+
+def describe_needs(needs: Needs, wavelength_nm: np.ndarray, gridded: GriddedBRDF) -> dict[str, Any]:
+    """Return what a result keeps of a scene: what was needed, and how far its numbers may be from a full run's.
+
+    Method "guided" solves every wavelength by itself and evaluates every node by itself, from
+    estimates of the whole measurement; method "paper" solves all nodes of a wavelength: there is
+    no halo to add, and the bound is rounding, for paper what its tolerance leaves.
+    """
+    return {
+        "wavelength_nm": np.asarray(wavelength_nm),
+        "wavelength_needed": needs.wavelength.astype(np.uint8),
+        "node_needed": needs.node.astype(np.uint8),
+        "difference_bound": EQUAL[gridded.method],
+        "difference_bound_meaning": "largest difference to the full run's grid, relative to its largest value",
+    }
 
 
 def plan_validation(schemes: Mapping[str, Folds]) -> list[PlanRow]:

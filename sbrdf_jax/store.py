@@ -36,13 +36,16 @@ from sbrdf_jax.layout import (
     read_cleaning,
     read_field,
     read_grid,
+    read_quadrature,
     write_cleaning,
     write_field,
     write_grid,
     write_guided,
+    write_quadrature,
     write_validation,
 )
 from sbrdf_jax.metrics import METRIC_AXES, METRIC_UNITS
+from sbrdf_jax.quadrature import Quadrature
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralField
 from sbrdf_jax.schema import SCHEMA_NAME, SCHEMA_VERSION, open_result
 
@@ -65,6 +68,13 @@ class RunResult:
     source_sha256: str = ""
     created_utc: str = ""
     versions: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    quadrature: Quadrature | None = None  # where the scene needed colours alone
+
+    @property
+    def measured_nm(self) -> np.ndarray:
+        """All measured wavelengths [nm], those too that the scene did not need."""
+        scene = self.plan.get("scene", {})
+        return np.asarray(scene["wavelength_nm"] if "wavelength_nm" in scene else self.gridded.wavelength_nm)
 
 
 def save(path: str | os.PathLike, result: RunResult) -> None:
@@ -98,7 +108,9 @@ def write_result(file: h5py.File, result: RunResult) -> None:
     write_input(file.create_group("input"), result)
     write_metrics(file.create_group("metrics"), result, grid)
     if result.validation:
-        write_validation(file.create_group("validation"), result.validation, grid)
+        write_validation(file.create_group("validation"), result.validation, grid, result.measured_nm)
+    if result.quadrature is not None:
+        write_quadrature(file.create_group("colour"), result.quadrature, grid)
     write_mapping(file.create_group("plan"), result.plan, "1")
     write_mapping(file.create_group("timing"), result.timing, "s")
 
@@ -150,6 +162,7 @@ def load(path: str | os.PathLike) -> RunResult:
             source_sha256=str(attribute(file, "source_sha256")),
             created_utc=str(attribute(file, "created_utc")),
             versions=json.loads(attribute(file, "versions")),
+            quadrature=read_quadrature(group_of(file, "colour"), gridded) if "colour" in file else None,
         )
 
 

@@ -1,9 +1,9 @@
 """`sbrdf evaluate`: values of a result at given directions, CSV in and CSV out."""
 
 import argparse
-import math
-from collections.abc import Iterator
 from pathlib import Path
+
+from sbrdf_jax.direction_file import COLUMNS, read_directions
 
 SUMMARY = "values of a result [1/sr] at the directions of a CSV file"
 EXAMPLE = """\
@@ -15,7 +15,6 @@ directions.csv:
   30,30,180
 """
 
-COLUMNS = ("theta_i_deg", "theta_o_deg", "phi_o_deg")
 ROWS_AT_A_TIME = 8192
 
 
@@ -69,41 +68,6 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def read_directions(path: Path) -> tuple[list[list[str]], list[list[float]]]:
-    """Read directions as written and as numbers [deg].
-
-    Args:
-        path: CSV with the header `theta_i_deg,theta_o_deg,phi_o_deg`; `#` comments and empty lines are skipped.
-
-    Returns:
-        The three columns of each row, as text and as numbers.
-
-    Raises:
-        UserError: a bad header, or a row that is no direction above the horizon; it is named by line and by row from 0.
-    """
-    from sbrdf_jax.errors import UserError
-    from sbrdf_jax.formats.text import shorten
-
-    if not path.is_file():
-        raise UserError(f"{path}: no such file, expected directions as CSV")
-    texts, angles, header = [], [], False
-    for number, words in _rows(path):
-        if not header:
-            if tuple(words) != COLUMNS:
-                found = shorten(",".join(words))
-                raise UserError(f"{path}:{number}: header: found {found}, expected {','.join(COLUMNS)}")
-            header = True
-            continue
-        where = f"{path}:{number}: row {len(texts)}"
-        if len(words) != len(COLUMNS):
-            raise UserError(f"{where}: found {len(words)} columns, expected {len(COLUMNS)}")
-        angles.append([_angle(where, *pair) for pair in zip(COLUMNS, words, strict=True)])
-        texts.append(words)
-    if not header:
-        raise UserError(f"{path}: found no header, expected {','.join(COLUMNS)}")
-    return texts, angles
-
-
 def parse_wavelengths(text: str, measured) -> list[float]:
     """Parse `--wavelengths` [nm].
 
@@ -127,27 +91,3 @@ def wavelength_names(wavelength_nm) -> list[str]:
     """Column names, `552nm`; in full where six digits do not tell two wavelengths apart."""
     short = [f"{w:g}nm" for w in wavelength_nm]
     return short if len(set(short)) == len(short) else [f"{float(w)!r}nm" for w in wavelength_nm]
-
-
-def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    from sbrdf_jax.formats.text import numbered_lines
-
-    for number, text in numbered_lines(path):
-        if text.strip() and not text.lstrip().startswith("#"):
-            yield number, [word.strip() for word in text.split(",")]
-
-
-def _angle(where: str, column: str, word: str) -> float:
-    from sbrdf_jax.errors import UserError
-    from sbrdf_jax.formats.text import shorten
-
-    try:
-        angle = float(word)
-    except ValueError:
-        raise UserError(f"{where}: {column}: found {shorten(word)}, expected a number") from None
-    if not math.isfinite(angle):
-        raise UserError(f"{where}: {column}: found {word}, expected a finite number")
-    if column != "phi_o_deg" and not 0 <= angle <= 90:
-        below = ", below the horizon" if angle > 90 else ""
-        raise UserError(f"{where}: {column}: found {word}{below}, expected 0 to 90")
-    return angle

@@ -2,8 +2,9 @@
 
 from typing import Any
 
+from sbrdf_jax.colour import ColourMatching
 from sbrdf_jax.host_blas import one_blas_thread
-from sbrdf_jax.options import RepresentOptions
+from sbrdf_jax.options import ErrorBudget, RepresentOptions
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralField
 
 
@@ -22,7 +23,11 @@ def represent(
 
 
 def represent_with_plan(
-    field: SpectralField, options: RepresentOptions, gridded: GriddedBRDF | None = None
+    field: SpectralField,
+    options: RepresentOptions,
+    gridded: GriddedBRDF | None = None,
+    matching: ColourMatching | None = None,
+    budget: ErrorBudget | None = None,
 ) -> tuple[CompactBRDF | LobeTensor, dict[str, Any]]:
     """Return what `represent` does, and what was computed and what was skipped, and why."""
     # here, because evaluation, which `lobe_tensor` uses, imports the values of this package's records
@@ -31,4 +36,4 @@ def represent_with_plan(
     if options.method == "paper":
         return paper.represent(field, options)
     with one_blas_thread():
-        return lobe_tensor.represent(field, options, gridded)
+        return lobe_tensor.represent(field, options, gridded, matching, budget)

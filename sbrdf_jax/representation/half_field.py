@@ -5,11 +5,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import distance_transform_edt
 
-from sbrdf_jax.evaluation import evaluate_on_axes
+from sbrdf_jax.evaluation import evaluate_in_chunks
 from sbrdf_jax.grid import has_data, midpoints
 from sbrdf_jax.records import GriddedBRDF, SpectralField
 
+SKIPPED_WEIGHT = 1e-3  # of a node that no scene needs: it has its neighbour's value, and is not to run wild
 UNKNOWN_WEIGHT = 0.01  # of an incident angle without data: it does not count, but is not to run wild
 BETWEEN_WEIGHT = 0.03  # of the error between the nodes, beside that at them, where the field is known there
 GUESS_WEIGHT = 1e-3  # where it is interpolated: enough that nothing runs wild
@@ -26,6 +28,7 @@ class Block(NamedTuple):
     phi_o: Float[np.ndarray, " p"]  # rad, 0 to pi
     brdf: Float[np.ndarray, "i o p wavelength"]  # 1/sr
     weight: Float[np.ndarray, "i o p"]  # of squared errors
+    needed: Bool[np.ndarray, "i o p"]  # what counts
 
 
 class HalfField(NamedTuple):
@@ -54,6 +57,10 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
     count = (len(phi_o) + 1) // 2
     half, mirrored = brdf[:, :, :count], brdf[:, :, ::-1][:, :, :count]
     even = (half + mirrored) / 2
+    needed = np.ones(even.shape[:3], bool)
+    if gridded is not None and gridded.needed is not None:
+        needed = np.asarray(gridded.needed)[:, :, :count]
+        even = np.where(needed[..., None], even, 0.0)
     energy = _energy(even, np.ones(count))
     usable = np.isfinite(energy) & (energy > 0)
     known = usable.copy()
@@ -63,35 +70,54 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
         known = usable
     if not usable.any():
         return HalfField((), known, 0.0)
-    asymmetry = float(np.sqrt((_energy(half - even, np.ones(count))[usable] / energy[usable]).max()))
+    odd = np.where(needed[..., None], half - even, 0.0)
+    asymmetry = float(np.sqrt((_energy(odd, np.ones(count))[usable] / energy[usable]).max()))
     place = np.arange(usable.argmax(), len(usable) - usable[::-1].argmax())  # from the first to the last
     share = np.where(known, 1.0, np.where(usable, UNKNOWN_WEIGHT, 0.0))[place]
     weight = np.where(np.arange(count) == count - 1, 1.0, 2.0)  # phi_o = 180 degrees is one node, others have twins
-    nodes = _block(theta_i[place], theta_o, phi_o[:count], even[place], weight, share)
+    needed = needed[place]
+    nodes = _block(theta_i[place], theta_o, phi_o[:count], even[place], weight, share, needed)
     mid_o, mid_phi = midpoints(theta_o), midpoints(phi_o[:count])
     twins = np.full(len(mid_phi), 2.0)
     less = np.minimum(share[:-1], share[1:])
     if gridded is None or gridded.field is None:
         between = _interpolate_logarithm(nodes, mid_o, mid_phi)
-        blocks = [nodes, _block(nodes.theta_i, mid_o, mid_phi, between, twins, GUESS_WEIGHT * share)]
+        every = np.ones(between.shape[:3], bool)
+        blocks = [nodes, _block(nodes.theta_i, mid_o, mid_phi, between, twins, GUESS_WEIGHT * share, every)]
         if field.interpolate_theta_i and len(nodes.theta_i) > 1:
             phi = np.sort(np.concatenate([nodes.phi_o, mid_phi]))
             tracked, brdf = _along_mirror_track(nodes, phi)
             both = np.where(np.arange(len(phi)) == len(phi) - 1, 1.0, 2.0)
-            blocks.append(_block(midpoints(nodes.theta_i), tracked, phi, brdf, both, GUESS_WEIGHT * less))
+            every = np.ones(brdf.shape[:3], bool)
+            blocks.append(_block(midpoints(nodes.theta_i), tracked, phi, brdf, both, GUESS_WEIGHT * less, every))
         return HalfField(tuple(blocks), known, asymmetry)
     finite = np.isin(np.asarray(gridded.field.wavelength_nm), np.asarray(field.basis.wavelength_nm))
     mid_i = midpoints(nodes.theta_i) if field.interpolate_theta_i else np.empty(0)
-    both = np.concatenate([nodes.theta_i, mid_i])
-    between = evaluate_on_axes(gridded, both, mid_o, mid_phi)[..., finite]
-    on, midway = np.split(between, [len(nodes.theta_i)])
-    blocks = [nodes, _block(nodes.theta_i, mid_o, mid_phi, on, twins, BETWEEN_WEIGHT * share)]
+    cell = cells_between(needed)
+    between = _evaluate_needed(gridded, nodes.theta_i, mid_o, mid_phi, cell)[..., finite]
+    blocks = [nodes, _block(nodes.theta_i, mid_o, mid_phi, between, twins, BETWEEN_WEIGHT * share, cell)]
     if len(mid_i):
-        blocks.append(_block(mid_i, mid_o, mid_phi, midway, twins, BETWEEN_WEIGHT * less))
+        cell = cell[:-1] & cell[1:]
+        between = _evaluate_needed(gridded, mid_i, mid_o, mid_phi, cell)[..., finite]
+        blocks.append(_block(mid_i, mid_o, mid_phi, between, twins, BETWEEN_WEIGHT * less, cell))
     return HalfField(tuple(blocks), known, asymmetry)
 
 
-def _block(theta_i, theta_o, phi_o, brdf, twins, share) -> Block:
+def cells_between(needed: Bool[np.ndarray, "i o p"]) -> Bool[np.ndarray, "i o-1 p-1"]:
+    """Which midpoints of theta_o and phi_o have four nodes around them that are needed."""
+    return needed[:, :-1, :-1] & needed[:, 1:, :-1] & needed[:, :-1, 1:] & needed[:, 1:, 1:]
+
+
+def _evaluate_needed(gridded: GriddedBRDF, theta_i, theta_o, phi_o, needed: Bool[np.ndarray, "i o p"]) -> np.ndarray:
+    """Evaluate those combinations of three axes that are needed; 0 elsewhere."""
+    angles = [mesh[needed] for mesh in np.meshgrid(theta_i, theta_o, phi_o, indexing="ij")]
+    value = np.zeros((*needed.shape, np.size(gridded.wavelength_nm)))
+    if needed.any():
+        value[needed] = evaluate_in_chunks(gridded, *angles)
+    return value
+
+
+def _block(theta_i, theta_o, phi_o, brdf, twins, share, needed) -> Block:
     """Return a block in which an incident angle weighs `share`, whatever its energy.
 
     Squares of errors count relative to the energy of the incident angle, as in eq. (18), and to
@@ -101,11 +127,24 @@ def _block(theta_i, theta_o, phi_o, brdf, twins, share) -> Block:
     usable = np.isfinite(energy) & (energy > 0) & (share > 0)
     clean = np.where(usable[:, None, None, None], brdf, 0.0)
     energy = np.where(usable, energy, 1.0)[:, None, None]
+    clean = _filled(clean, needed)
     each = (clean**2).sum(axis=-1)
-    number = len(theta_o) * twins.sum()
+    number = (needed * twins).sum(axis=(1, 2))[:, None, None]
     relative = RELATIVE_SHARE / (number * each + RELATIVE_FLOOR * energy)
     weight = np.where(usable, share, 0.0)[:, None, None] * (1 / energy + relative) * twins
-    return Block(theta_i, theta_o, phi_o, clean, weight)
+    return Block(theta_i, theta_o, phi_o, clean, np.where(needed, weight, SKIPPED_WEIGHT * weight), needed)
+
+
+def _filled(brdf: np.ndarray, needed: Bool[np.ndarray, "i o p"]) -> np.ndarray:
+    """Give what is skipped the value of the nearest direction of its incident angle that is needed."""
+    if needed.all():
+        return brdf
+    filled = brdf.copy()
+    for value, mask in zip(filled, needed, strict=True):
+        if mask.any() and not mask.all():
+            nearest = distance_transform_edt(~mask, return_distances=False, return_indices=True)
+            value[:] = value[tuple(nearest)]
+    return filled
 
 
 def _energy(brdf, twins):

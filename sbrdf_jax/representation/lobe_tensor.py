@@ -4,6 +4,7 @@ Incident angles are scaled to equal energy; a directional factor of the half ang
 lobe, wherever its peak is, so that the factors of theta_i and theta_o are smooth and few.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Float
 
 from sbrdf_jax import colour
 from sbrdf_jax.encoding import decode, spectral_vectors, vector_basis
-from sbrdf_jax.options import RepresentOptions
+from sbrdf_jax.options import ErrorBudget, RepresentOptions
 from sbrdf_jax.records import GriddedBRDF, LobeTensor, SpectralBasis, SpectralField, Status
 from sbrdf_jax.representation.direction_functions import (
     direction_functions,
@@ -54,7 +55,11 @@ def stored_numbers(tensor: LobeTensor) -> int:
 
 
 def represent(
-    field: SpectralField, options: RepresentOptions, gridded: GriddedBRDF | None = None
+    field: SpectralField,
+    options: RepresentOptions,
+    gridded: GriddedBRDF | None = None,
+    matching: colour.ColourMatching | None = None,
+    budget: ErrorBudget | None = None,
 ) -> tuple[LobeTensor, dict[str, Any]]:
     """Return the smallest lobe tensor that meets the target, or the best that there is, and what was found.
 
@@ -64,6 +69,8 @@ def represent(
         options: `target` is used.
         gridded: The grid stage, if there is one: the spectra before encoding, which incident
             angles have data, and the field between the nodes.
+        matching: Colours of the field's wavelengths, where they are not those of all that was measured.
+        budget: An error that is enough, where the target asks for less or for another thing.
 
     Returns:
         The tensor, and a plan: ranks, what was promised and what was measured, `warnings`.
@@ -72,6 +79,8 @@ def represent(
         Least squares of the values themselves; the clip at 0 comes last and lowers the error of a
         field that is nowhere negative. What is odd in phi_o is dropped, with a warning.
     """
+    if gridded is not None:
+        field = dataclasses.replace(field, interpolate_theta_i=gridded.interpolate_theta_i)
     theta_i, theta_o = np.asarray(field.theta_i, np.float64), np.asarray(field.theta_o, np.float64)
     brdf = np.asarray(
         decode(np.asarray(field.coefficient, np.float64), field.basis) if gridded is None else gridded.brdf
@@ -87,15 +96,18 @@ def represent(
     functions = num_i, min(len(theta_o), MOST_FUNCTIONS), num_direction_functions(floor)
     num_wavelengths = np.size(field.basis.wavelength_nm)
     layout = Layout(len(theta_i), functions, num_wavelengths, field.basis.kind == "data")
-    target = make_target(options.target, len(theta_i), num_wavelengths)
-    status = np.where(np.isfinite(brdf).all(axis=(1, 2, 3)), int(Status.SKIPPED), int(Status.NONFINITE))
+    target = make_target(options.target, len(theta_i), num_wavelengths, budget)
+    finite = np.isfinite(brdf).all(axis=3)
+    if gridded is not None and gridded.needed is not None:
+        finite |= ~np.asarray(gridded.needed)
+    status = np.where(finite.all(axis=(1, 2)), int(Status.SKIPPED), int(Status.NONFINITE))
     status = np.where(half.known, int(Status.OK), status)
     basis = field.basis
     if not half.blocks:  # zero or nothing everywhere
         factors, log_scale = Factors(*(np.zeros((n, 1)) for n in functions), _no_core(basis)), np.zeros(num_i)
         achieved = 0.0
     else:
-        factors, log_scale, basis, achieved = _fit(field, half, layout, target, floor)
+        factors, log_scale, basis, achieved = _fit(field, half, layout, target, floor, matching)
     tensor = LobeTensor(
         theta_i,
         ends,
@@ -109,7 +121,7 @@ def represent(
     return tensor, _plan(tensor, target, achieved, half)
 
 
-def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, floor: float):
+def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, floor: float, matching):
     """Return factors, scales, the basis that they are in, and what was measured of the target."""
     vectors, to_coefficient = _channels(field.basis, half)
     place = np.isin(np.asarray(field.theta_i, np.float64), half.nodes.theta_i)
@@ -147,26 +159,25 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
     nodes, counts = half.nodes, half.known[place]
     function = np.stack([_functions(angle, nodes.theta_o, nodes.phi_o, floor) for angle in nodes.theta_i])
     node_rows, node_columns = np.searchsorted(rows, nodes.theta_i), np.searchsorted(columns, nodes.theta_o)
-    matching = None
-    if target.kind == "delta_e":
+    if "delta_e" in (target.kind, *(stop.kind for stop in target.stops)) and matching is None:
         matching = colour.colour_matching(np.asarray(field.basis.wavelength_nm))
     twins = np.r_[np.full(len(nodes.phi_o) - 1, 2.0), 1.0]
 
-    def measure(factors: Factors) -> float:
+    def measure(target: Target, factors: Factors) -> float:
         stored = layout.numbers(*factors.ranks, factors.core.shape[3])
         if target.kind in ("ratio", "numbers"):
             return measured(target, stored, nodes.brdf, nodes.brdf, twins, counts, None)
         amplitude = fit.amplitudes(factors.theta_i, factors.theta_o, factors.core)[np.ix_(node_rows, node_columns)]
         value = ((function @ factors.direction) @ amplitude) @ vectors[: factors.core.shape[3]]
         value = np.maximum(value / scale[node_rows][:, None, None, None], 0.0)
-        return measured(target, stored, value, nodes.brdf, twins, counts, matching)
+        return measured(target, stored, value, nodes.brdf, twins, counts, matching, nodes.needed)
 
     def is_enough(factors: Factors) -> bool:
-        return target.kind in ("error", "delta_e") and is_met(target, measure(factors))
+        return bool(target.stops) and all(is_met(stop, measure(stop, factors)) for stop in target.stops)
 
     first = min(2, count) if layout.stores_vectors else count
     factors = grow(fit, layout.numbers, target.budget, is_enough, first_channels=first)
-    achieved, used = measure(factors), factors.core.shape[3]
+    achieved, used = measure(target, factors), factors.core.shape[3]
     basis = vector_basis(field.basis.wavelength_nm, vectors[:used]) if layout.stores_vectors else field.basis
     return factors._replace(core=factors.core @ to_coefficient[:used, :used]), log_scale, basis, achieved
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sbrdf_jax import colour
-from sbrdf_jax.options import TargetOptions
+from sbrdf_jax.options import ErrorBudget, TargetOptions
 
 PAPER_DIRECTIONS = 13 * 49  # the paper's nodes of one incident angle, copies at the pole and at 360 degrees counted
 
@@ -17,6 +17,12 @@ class Target(NamedTuple):
     kind: str
     value: float
     budget: float  # most stored numbers, over all incident angles
+    enough: tuple[tuple[str, float], ...] = ()  # errors by kind: where all of them are reached, the search ends
+
+    @property
+    def stops(self) -> tuple["Target", ...]:
+        """Errors at which to stop, as targets of their own."""
+        return tuple(Target(kind, value, float("inf")) for kind, value in self.enough)
 
     @property
     def text(self) -> str:
@@ -29,14 +35,31 @@ class Target(NamedTuple):
         }[self.kind]
 
 
-def make_target(options: TargetOptions, num_theta_i: int, num_wavelengths: int) -> Target:
-    """Return the target that the options give, for a grid."""
-    kind, value = next((name, value) for name, value in vars(options).items() if value is not None)
-    budget = {
+def make_target(
+    options: TargetOptions, num_theta_i: int, num_wavelengths: int, budget: ErrorBudget | None = None
+) -> Target:
+    """Return the target that the options give, for a grid; of a target and a scene's budget the stricter.
+
+    A budget of numbers and one of error hold both: what is reached first ends the search.
+    """
+    kind, value = _given(options)
+    enough = {kind: value} if kind in ("error", "delta_e") else {}
+    if budget is not None:
+        name, limit = _given(budget)
+        if name == kind:
+            value = min(value, limit)
+            enough = {kind: value}
+        else:
+            enough[name] = limit
+    most = {
         "ratio": num_theta_i * PAPER_DIRECTIONS * num_wavelengths / value,
         "numbers": num_theta_i * value,
     }.get(kind, float("inf"))
-    return Target(kind, float(value), float(budget))
+    return Target(kind, float(value), float(most), tuple(enough.items()))
+
+
+def _given(options: TargetOptions | ErrorBudget) -> tuple[str, float]:
+    return next((name, float(value)) for name, value in vars(options).items() if value is not None)
 
 
 def node_errors(
@@ -52,11 +75,15 @@ def median_delta_e(
     found: Float[np.ndarray, "i o p wavelength"],
     wanted: Float[np.ndarray, "i o p wavelength"],
     matching: colour.ColourMatching,
+    needed: Bool[np.ndarray, "i o p"],
 ) -> Float[np.ndarray, " i"]:
-    """Median colour difference under D65 over the nodes of each incident angle, from those on one side."""
-    difference = colour.delta_e_2000(found, wanted, matching)
-    difference = np.concatenate([difference, difference[:, :, -2::-1]], axis=2)
-    return np.median(difference.reshape(len(difference), -1), axis=1)
+    """Median colour difference over the needed nodes of each incident angle, from those on one side."""
+    difference = np.where(needed, colour.delta_e_2000(found, wanted, matching), np.nan)
+    difference = np.concatenate([difference, difference[:, :, -2::-1]], axis=2).reshape(len(difference), -1)
+    counts = needed.any(axis=(1, 2))
+    median = np.zeros(len(difference))
+    median[counts] = np.nanmedian(difference[counts], axis=1)
+    return median
 
 
 def measured(
@@ -67,14 +94,17 @@ def measured(
     twins: Float[np.ndarray, " p"],
     known: Bool[np.ndarray, " i"],
     matching: colour.ColourMatching | None,
+    needed: Bool[np.ndarray, "i o p"] | None = None,
 ) -> float:
     """Return what stands beside the promise: the ratio, the numbers, or the worst incident angle's error."""
+    needed = np.ones(found.shape[:3], bool) if needed is None else needed
     if target.kind in ("ratio", "numbers"):
         return target.value * (target.budget / stored if target.kind == "ratio" else stored / target.budget)
     if target.kind == "error":
+        found, wanted = (np.where(needed[..., None], brdf, 0.0) for brdf in (found, wanted))
         return float(node_errors(found, wanted, twins)[known].max(initial=0.0))
     assert matching is not None
-    return float(median_delta_e(found, wanted, matching)[known].max(initial=0.0))
+    return float(median_delta_e(found, wanted, matching, needed)[known].max(initial=0.0))
 
 
 def is_met(target: Target, value: float) -> bool:

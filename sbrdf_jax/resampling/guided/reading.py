@@ -8,6 +8,7 @@ from sbrdf_jax.records import GriddedBRDF
 from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_with_error
 from sbrdf_jax.resampling.guided.lanes import take_field
 
+SAME_ANGLE = 1e-9  # rad; degrees in a file and back are not exact
 SMALLEST_BATCH = 64  # directions evaluated at once; fewer are padded
 
 
@@ -35,7 +36,7 @@ def read_nodes(
     axes = np.meshgrid(grid.theta_i, grid.theta_o, grid.phi_o[: grid.num_azimuths], indexing="ij")
     value = np.full((2, *shape, len(field.wavelength_nm)), np.nan)
     fresh, lanes = half, np.ones(len(field.wavelength_nm), bool)
-    if known is not None:
+    if known is not None and known_rows(known, grid) is not None:
         fresh, lanes = _take_known(value, half, grid, np.asarray(field.wavelength_nm), known)
     for nodes, wavelengths in ((fresh, slice(None)), (half & ~fresh, lanes)):
         place = np.flatnonzero(nodes)
@@ -54,15 +55,30 @@ def _take_known(value: np.ndarray, half: np.ndarray, grid: Grid, wavelength_nm: 
     """Fill in what an earlier answer holds; return the nodes that it lacks, and the wavelengths that it lacks there."""
     held = np.isin(wavelength_nm, known.wavelength_nm)
     columns = np.searchsorted(known.wavelength_nm, wavelength_nm[held])
+    rows = known_rows(known, grid)
+    assert rows is not None
     fresh = half.copy()
-    for row, angle in enumerate(np.asarray(known.theta_i)):
-        place = int(np.argmin(np.abs(grid.theta_i - angle)))
-        for out, source in zip(value, (known.brdf, known.standard_error), strict=True):
-            found = np.asarray(source)[row, :, : half.shape[2]][..., columns]
-            has = half[place] & np.isfinite(found).all(axis=-1)
-            out[place][has[..., None] & held] = found[has].reshape(-1)
+    for place in np.flatnonzero(rows >= 0):
+        found = [
+            np.asarray(a)[rows[place], :, : half.shape[2]][..., columns] for a in (known.brdf, known.standard_error)
+        ]
+        has = half[place] & np.isfinite(found[0]).all(axis=-1)
+        for out, source in zip(value, found, strict=True):
+            out[place][has[..., None] & held] = source[has].reshape(-1)
         fresh[place] &= ~has
     return fresh, ~held
+
+
+def known_rows(known: GriddedBRDF, grid: Grid) -> np.ndarray | None:
+    """Return the row of each incident angle of a grid in an earlier answer, -1 where it lacks it.
+
+    None where the nodes of outgoing directions are others.
+    """
+    for one, other in ((known.theta_o, grid.theta_o), (known.phi_o, grid.phi_o)):
+        if np.shape(one) != np.shape(other) or np.abs(np.asarray(one) - other).max() > SAME_ANGLE:
+            return None
+    distance = np.abs(grid.theta_i[:, None] - np.asarray(known.theta_i))
+    return np.where(distance.min(axis=1) <= SAME_ANGLE, distance.argmin(axis=1), -1)
 
 
 def _read_batches(field: GuidedField, whiten: np.ndarray, angles: list[np.ndarray], most: int) -> np.ndarray:
