@@ -22,6 +22,7 @@ COMMANDS = {
     "sample": "write the embedded sample as a raw file",
     "batch": "many materials, as a library file says",
     "report": "figures and a page of one or more results",
+    "footprint": "which directions of its materials a scene looks at",
     "schema": "JSON schema of the config, for editors",
 }
 STOPPED_BATCH = "finished results stay; the same command goes on from there"
