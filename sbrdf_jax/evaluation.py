@@ -74,8 +74,11 @@ def evaluate(
     wavelength = None if wavelength_nm is None else jnp.atleast_1d(jnp.asarray(wavelength_nm, dtype))
     kernel = functools.partial(direction_kernel, result, wavelength_nm=wavelength)
     flat = tuple(a.reshape(-1) for a in angles)
-    is_guided = isinstance(getattr(result, "field", result), GuidedField)
-    value = each_direction(lambda angles: kernel(*angles), flat) if is_guided else jax.vmap(kernel)(*flat)
+    field = getattr(result, "field", result)
+    if isinstance(field, GuidedField):
+        value = each_direction(lambda angles: kernel(*angles), flat, len(field.wavelength_nm))
+    else:
+        value = jax.vmap(kernel)(*flat)
     if wavelength is not None:
         outside = outside_range(wavelength, jnp.asarray(measured_wavelengths(result), dtype))
         value = jnp.where(outside[None, :], jnp.nan, value)

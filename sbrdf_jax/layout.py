@@ -52,6 +52,8 @@ def write_grid(group: h5py.Group, gridded: GriddedBRDF) -> None:
     status_dataset(group, gridded.status, [axes["wavelength"]])
     if gridded.needed is not None:
         dataset(group, "needed", np.asarray(gridded.needed, np.uint8), "1", directions)
+    if gridded.residual_variance is not None:
+        dataset(group, "residual_variance", gridded.residual_variance, "1", directions)
     if gridded.standard_error is not None:
         dataset(group, "standard_error", gridded.standard_error, "1/sr", [*directions, axes["wavelength"]])
 
@@ -184,6 +186,7 @@ def read_grid(group: h5py.Group, field: h5py.Group | None = None) -> GriddedBRDF
         bilateral=bool(attribute(group, "bilateral")),
         interpolate_theta_i=bool(attribute(group, "interpolate_theta_i")),
         standard_error=read(group, "standard_error", (*directions, *lanes)) if "standard_error" in group else None,
+        residual_variance=read(group, "residual_variance", directions) if "residual_variance" in group else None,
         needed=read(group, "needed", directions) > 0 if "needed" in group else None,
         field=None if field is None else read_guided(field),
     )

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sbrdf_jax import colour
-from sbrdf_jax.angles import angle_between
+from sbrdf_jax.angles import angle_between, fold_azimuth
 from sbrdf_jax.encoding import decode
 from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_on_axes, measured_wavelengths
 from sbrdf_jax.grid import midpoints
@@ -69,7 +69,7 @@ def measure(
     """
     value, warnings = measure_grid(gridded, absolute=absolute, seed=seed)
     if compact is not None:
-        value |= error_between(compact, gridded) | compression(compact)
+        value |= error_between(compact, gridded) | compression(compact, float(needed_nodes(gridded).mean()))
         live = live_wavelengths(gridded)
         if matching is None:
             matching = colour.colour_matching(np.asarray(gridded.wavelength_nm)[live])
@@ -131,9 +131,12 @@ def error_at_nodes(compact: CompactBRDF | LobeTensor, gridded: GriddedBRDF, matc
         if not counts[i]:
             continue
         original = np.asarray(gridded.brdf[i])[needed[i]][:, live]
-        theta_o, phi_o = (axis[needed[i]] for axis in mesh)
-        angles = np.full(theta_o.shape, theta_i), theta_o, phi_o
-        reconstructed = evaluate_in_chunks(compact, *angles, chunk_size=CHUNK_SIZE)
+        if needed[i].all():
+            reconstructed = on_axes(compact, theta_i, gridded.theta_o, gridded.phi_o).reshape(original.shape)
+        else:
+            theta_o, phi_o = (axis[needed[i]] for axis in mesh)
+            angles = np.full(theta_o.shape, theta_i), theta_o, phi_o
+            reconstructed = evaluate_in_chunks(compact, *angles, chunk_size=CHUNK_SIZE)
         error_energy.append(((reconstructed - original) ** 2).sum())
         energy.append((original**2).sum())
         deviation.append(relative_deviation(reconstructed, original).ravel())
@@ -271,14 +274,14 @@ def stored_numbers(compact: CompactBRDF | LobeTensor) -> int:
     return held + np.size(compact.basis.wavelength_nm) + num_coefficients + num_harmonics + vectors
 
 
-def compression(compact: CompactBRDF | LobeTensor) -> dict:
+def compression(compact: CompactBRDF | LobeTensor, needed_share: float = 1.0) -> dict:
     """Numbers of the grid at the paper's 13 x 49 x wavelengths an incident angle over the numbers of the compact form.
 
     Only 13 x 49 - 60 of those directions are distinct, and half of them are mirror images.
     `compression_ratio` counts everything that is stored; `compression_ratio_paper` only
     harmonics, height and width, as the paper does, of its form alone.
     """
-    grid = PAPER_DIRECTIONS * np.size(compact.basis.wavelength_nm)
+    grid = needed_share * PAPER_DIRECTIONS * np.size(compact.basis.wavelength_nm)
     everything = {"compression_ratio": np.size(compact.theta_i) * grid / stored_numbers(compact)}
     if isinstance(compact, LobeTensor):
         return everything
@@ -347,13 +350,11 @@ def albedo(result, whole: Bool[np.ndarray, " theta_i"] | None = None) -> Float[n
     theta_o = (point + 1) * np.pi / 4
     weight = weight * np.pi / 4 * np.cos(theta_o) * np.sin(theta_o)
     phi_o = (np.arange(num_phi) + 0.5) * (2 * np.pi / num_phi)
-    if isinstance(result, LobeTensor) or getattr(result, "bilateral", False):
-        phi_o = phi_o[: (num_phi + 1) // 2]  # the other half is its mirror image
     nodes = np.asarray(result.theta_i)
     rows = np.full((len(nodes), np.size(measured_wavelengths(result))), np.nan)
     for i in np.arange(len(nodes)) if whole is None else np.flatnonzero(whole):
         rows[i] = weight @ on_axes(result, nodes[i], theta_o, phi_o).sum(axis=1)
-    return rows * (2 * np.pi / len(phi_o))
+    return rows * (2 * np.pi / num_phi)
 
 
 def albedo_warnings(albedo: np.ndarray, result, stage: str) -> list[str]:
@@ -371,8 +372,18 @@ def albedo_warnings(albedo: np.ndarray, result, stage: str) -> list[str]:
 
 
 def on_axes(result, theta_i: float, theta_o, phi_o) -> Float[np.ndarray, "theta_o phi_o wavelength"]:
-    """Evaluate one incident angle at every combination of theta_o and phi_o [rad]."""
+    """Evaluate one incident angle at every combination of theta_o and phi_o [rad]; mirror twins once."""
+    phi_o = np.asarray(phi_o)
+    back = np.arange(len(phi_o))
+    if _is_symmetric(result):
+        _, first, back = np.unique(np.round(fold_azimuth(phi_o), 12), return_index=True, return_inverse=True)
+        phi_o, back = phi_o[first], back.reshape(-1)
     if isinstance(result, GriddedBRDF):
-        return evaluate_on_axes(result, np.array([theta_i]), np.asarray(theta_o), np.asarray(phi_o))[0]
-    mesh = np.meshgrid(np.asarray(theta_o), np.asarray(phi_o), indexing="ij")
-    return evaluate_in_chunks(result, np.full(mesh[0].shape, theta_i), *mesh, chunk_size=CHUNK_SIZE)
+        return evaluate_on_axes(result, np.array([theta_i]), np.asarray(theta_o), phi_o)[0][:, back]
+    mesh = np.meshgrid(np.asarray(theta_o), phi_o, indexing="ij")
+    return evaluate_in_chunks(result, np.full(mesh[0].shape, theta_i), *mesh, chunk_size=CHUNK_SIZE)[:, back]
+
+
+def _is_symmetric(result) -> bool:
+    """Whether a result is the same on both sides of the plane of incidence."""
+    return isinstance(result, LobeTensor) or bool(getattr(result, "bilateral", False))

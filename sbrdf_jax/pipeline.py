@@ -177,6 +177,8 @@ def restrict_theta_i(
         brdf=np.asarray(gridded.brdf)[rows],
         extrapolated=np.asarray(gridded.extrapolated)[rows],
         needed=None,
+        standard_error=None,
+        residual_variance=None,
     )
     coefficient = np.asarray(field.coefficient)[rows]
     return dataclasses.replace(field, theta_i=part.theta_i, coefficient=coefficient), part
@@ -201,7 +203,12 @@ def finite_part(gridded: GriddedBRDF) -> GriddedBRDF:
     per_wavelength = ("wavelength_nm", "kkt_residual", "num_steps", "status")
     parts = {name: np.asarray(getattr(gridded, name))[live] for name in per_wavelength}
     return dataclasses.replace(
-        gridded, brdf=np.asarray(gridded.brdf)[..., live], standard_error=None, field=None, **parts
+        gridded,
+        brdf=np.asarray(gridded.brdf)[..., live],
+        standard_error=None,
+        residual_variance=None,
+        field=None,
+        **parts,
     )
 
 

@@ -89,6 +89,7 @@ class GriddedBRDF:
     bilateral: bool = False
     interpolate_theta_i: bool = True
     standard_error: Any = None  # [theta_i, theta_o, phi_o, wavelength] 1/sr, where the method has one
+    residual_variance: Any = None  # [theta_i, theta_o, phi_o] the error's part that no wavelength changes
     field: Any = None  # what evaluates any direction, where that is more than the nodes
     needed: Any = None  # [theta_i, theta_o, phi_o] bool: nodes that were computed, the others are nan; None: all
 

@@ -89,6 +89,8 @@ def part_of(known: GriddedBRDF, grid: Grid, needs: Needs, wavelength_nm: np.ndar
     error = known.standard_error
     if error is not None:
         parts["standard_error"] = np.where(node[..., None], np.asarray(error)[row][..., lane], np.nan)
+    if known.residual_variance is not None:
+        parts["residual_variance"] = np.where(node, np.asarray(known.residual_variance)[row], np.nan)
     if known.field is not None:
         parts["field"] = take_field(known.field, np.searchsorted(known.field.wavelength_nm, wanted))
     return dataclasses.replace(

@@ -96,7 +96,8 @@ def represent(
     functions = num_i, min(len(theta_o), MOST_FUNCTIONS), num_direction_functions(floor)
     num_wavelengths = np.size(field.basis.wavelength_nm)
     layout = Layout(len(theta_i), functions, num_wavelengths, field.basis.kind == "data")
-    target = make_target(options.target, len(theta_i), num_wavelengths, budget)
+    share = 1.0 if gridded is None or gridded.needed is None else float(np.mean(gridded.needed))
+    target = make_target(options.target, len(theta_i), num_wavelengths, budget, share)
     finite = np.isfinite(brdf).all(axis=3)
     if gridded is not None and gridded.needed is not None:
         finite |= ~np.asarray(gridded.needed)

@@ -134,14 +134,14 @@ def resample_guided(
     fit = fit_field(samples, options, report, centres, needed=needs.wavelength, estimates=estimates, known=earlier)
     if report is not None:
         report("nodes")
-    value, error = read_nodes(fit.field, grid, fit.whiten, needs.node, known)
+    nodes = read_nodes(fit.field, grid, fit.whiten, needs.node, known, estimates.node_variance)
     theta_i = needs.theta_i
     return GriddedBRDF(
         theta_i=jnp.asarray(grid.theta_i[theta_i]),
         theta_o=jnp.asarray(grid.theta_o),
         phi_o=jnp.asarray(grid.phi_o),
         wavelength_nm=jnp.asarray(samples.wavelength_nm[needs.wavelength]),
-        brdf=jnp.asarray(value),
+        brdf=jnp.asarray(nodes.value),
         extrapolated=jnp.asarray(extrapolated_nodes(samples, grid)[theta_i]),
         kkt_residual=jnp.asarray(fit.kkt_residual),
         num_steps=jnp.asarray(fit.num_steps),
@@ -150,7 +150,8 @@ def resample_guided(
         window=options.window,
         bilateral=True,
         interpolate_theta_i=grid.interpolate_theta_i,
-        standard_error=jnp.asarray(error),
+        standard_error=jnp.asarray(nodes.standard_error),
+        residual_variance=nodes.variance,
         field=fit.field,
         needed=None if needs.node[theta_i].all() else needs.node[theta_i],
     )

@@ -47,6 +47,7 @@ class Estimates(NamedTuple):
     inverse: np.ndarray  # [centre, centre] of prior plus noise
     residual: np.ndarray  # [centre, wavelength] z minus the lobe model's
     model: np.ndarray  # [centre, wavelength] z of the lobe model
+    node_variance: dict[bytes, np.ndarray]  # of the nodes that were asked for, by grid: the same at every wavelength
 
 
 def estimate(
@@ -102,6 +103,7 @@ def estimate(
         inverse=inverse,
         residual=residual,
         model=model,
+        node_variance={},
     )
 
 
@@ -166,4 +168,5 @@ def restore_estimates(field: GuidedField, samples: RawSamples, centres: Centres)
         inverse=mirror_lower(lower_product(whiten)),
         residual=residual,
         model=model,
+        node_variance={},
     )
