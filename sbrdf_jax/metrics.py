@@ -17,6 +17,7 @@ from sbrdf_jax.angles import angle_between, fold_azimuth
 from sbrdf_jax.encoding import decode
 from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_on_axes, measured_wavelengths
 from sbrdf_jax.grid import midpoints
+from sbrdf_jax.needs import restrict_theta_i
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralBasis, SpectralField
 from sbrdf_jax.representation import lobe_tensor
 from sbrdf_jax.representation.half_field import cells_between
@@ -78,16 +79,26 @@ def measure(
         value |= error_at_nodes(compact, gridded, matching)
         if matching.note:
             warnings.append(f"colour: {matching.note}")
+        rows = np.isin(np.asarray(gridded.theta_i), np.asarray(compact.theta_i))
+        needed, whole = needed_nodes(gridded)[rows], whole_hemispheres(gridded)[rows]
         if field is not None:
-            value |= error_split(compact, field, gridded)
-        share, depth, reciprocity = off_node_scores(compact, seed=seed, needed=needed_nodes(gridded))
+            split = error_split(compact, *restrict_theta_i(field, gridded, np.asarray(compact.theta_i)))
+            value |= {name: _on_rows(part, rows) for name, part in split.items()}
+        share, depth, reciprocity = off_node_scores(compact, seed=seed, needed=needed)
         value |= {"negative_share": share, "negative_depth": depth, "reciprocity_error_compact": reciprocity}
-        of_compact = albedo(compact, whole_hemispheres(gridded))
+        of_compact = albedo(compact, whole)
         value["albedo_compact"] = np.full(value["albedo"].shape, np.nan)
-        value["albedo_compact"][:, live] = of_compact
+        value["albedo_compact"][np.ix_(rows, live)] = of_compact
         if absolute:
             warnings += albedo_warnings(of_compact, compact, "compact")
     return Metrics({name: np.asarray(v) for name, v in value.items()}, tuple(warnings))
+
+
+def _on_rows(part: np.ndarray, rows: Bool[np.ndarray, " theta_i"]) -> np.ndarray:
+    """Put values of some incident angles among all, nan at the others."""
+    every = np.full(len(rows), np.nan)
+    every[rows] = part
+    return every
 
 
 def measure_grid(gridded: GriddedBRDF, *, absolute: bool = True, seed: int = 0) -> tuple[dict, list[str]]:

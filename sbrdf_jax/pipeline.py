@@ -11,12 +11,12 @@ from sbrdf_jax.encoding import coefficients_allowed, data_basis, encode_field, m
 from sbrdf_jax.folds import LEAVE_ONE_OUT, Folds, make_folds
 from sbrdf_jax.grid import Grid, has_data, make_grid
 from sbrdf_jax.metrics import live_wavelengths, measure, needed_nodes
-from sbrdf_jax.needs import Needs
+from sbrdf_jax.needs import Needs, restrict_theta_i
 from sbrdf_jax.options import EncodeOptions, RunOptions
-from sbrdf_jax.plan import PlanRow, describe_needs, plan_run, plan_validation
+from sbrdf_jax.plan import PlanRow, describe_needs, plan_run, plan_validation, predict_cost
 from sbrdf_jax.progress import Progress, StageClock
 from sbrdf_jax.quadrature import Quadrature, choose_quadrature
-from sbrdf_jax.records import STATUS_TEXT, GriddedBRDF, RawSamples, SpectralBasis, SpectralField, Status
+from sbrdf_jax.records import STATUS_TEXT, GriddedBRDF, RawSamples, SpectralBasis, Status
 from sbrdf_jax.representation import represent_with_plan
 from sbrdf_jax.resampling import resample
 from sbrdf_jax.resampling.guided import describe_fit
@@ -41,6 +41,7 @@ class Prepared:
     warnings: tuple[str, ...]
     folds: Mapping[str, Folds]  # by scheme; empty where validation is off
     needs: Needs  # what the scene needs of the measurement and the grid
+    cost: Mapping[str, tuple[float, float]]  # predicted seconds and MiB by stage
     quadrature: Quadrature | None = None  # where the scene needs colours alone
     earlier: Earlier | None = None  # a result whose parts may be reused
 
@@ -72,6 +73,7 @@ def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
     rows = plan_run(cleaned.samples, raw.num_samples, grid, allowed.coefficients, options, needs)
     folds = make_folds(raw, cleaned.report, options.validate, mirror_twins=options.input.bilateral is not False)
     rows += plan_validation(folds)
+    cost = predict_cost(cleaned.samples, grid, options, needs)
     warnings = [f"not measured: {text}" for text in cleaned.report.coverage.missing]
     if allowed.warning:
         warnings.append(allowed.warning)
@@ -79,7 +81,7 @@ def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
         reason = "another source, other versions or other options of input, grid or resample"
         warnings.append(f"runtime.resume_from: {options.runtime.resume_from}: nothing of it is used: {reason}")
         earlier = None
-    return Prepared(cleaned, grid, rows, tuple(warnings), folds, needs, quadrature, earlier)
+    return Prepared(cleaned, grid, rows, tuple(warnings), folds, needs, cost, quadrature, earlier)
 
 
 def process(
@@ -153,6 +155,7 @@ def process(
         validation=validation,
         plan={
             "needed": {f"{row.stage} {row.what}": dataclasses.asdict(row) for row in ready.rows},
+            "predicted": {name: {"seconds": pair[0], "mebibytes": pair[1]} for name, pair in ready.cost.items()},
             "represent": searched,
             "coefficients_used": used,
             "scene": describe_needs(needs, raw.wavelength_nm, gridded),
@@ -162,26 +165,6 @@ def process(
         source_sha256=raw.source_sha256,
         quadrature=ready.quadrature,
     )
-
-
-def restrict_theta_i(
-    field: SpectralField, gridded: GriddedBRDF, theta_i: np.ndarray
-) -> tuple[SpectralField, GriddedBRDF]:
-    """Return what the compact form is made of: the incident angles [rad] that are needed, of a grid that has more."""
-    rows = np.isin(np.asarray(gridded.theta_i), theta_i)
-    if rows.all():
-        return field, gridded
-    part = dataclasses.replace(
-        gridded,
-        theta_i=np.asarray(gridded.theta_i)[rows],
-        brdf=np.asarray(gridded.brdf)[rows],
-        extrapolated=np.asarray(gridded.extrapolated)[rows],
-        needed=None,
-        standard_error=None,
-        residual_variance=None,
-    )
-    coefficient = np.asarray(field.coefficient)[rows]
-    return dataclasses.replace(field, theta_i=part.theta_i, coefficient=coefficient), part
 
 
 def spectral_basis(gridded: GriddedBRDF, options: EncodeOptions) -> SpectralBasis:

@@ -8,11 +8,17 @@ import numpy as np
 
 from sbrdf_jax.folds import Folds
 from sbrdf_jax.grid import Grid
+from sbrdf_jax.multipliers import MAX_UNKNOWNS
 from sbrdf_jax.needs import Needs
 from sbrdf_jax.options import RunOptions
 from sbrdf_jax.records import GriddedBRDF, RawSamples
+from sbrdf_jax.resampling.guided.merging import MAX_CENTRES as MOST_CENTRES
 
 CRITICAL_ANGLES = 21
+MEBI = 2**20
+RATE = 3e10  # operations a second of a large product
+FEATURES = 1100  # of a direction on the guided method's two grids
+NODES_OF_A_HEMISPHERE = 13 * 25
 EQUAL = {"guided": 1e-9, "paper": 1e-6}  # see `describe_needs`
 
 
@@ -100,8 +106,34 @@ def plan_validation(schemes: Mapping[str, Folds]) -> list[PlanRow]:
     return [PlanRow("validate", name, counts[name], counts[name], folds.how) for name, folds in schemes.items()]
 
 
-def plan_text(rows: list[PlanRow]) -> str:
-    """Return the plan as a table."""
+def plan_text(rows: list[PlanRow], cost: Mapping[str, tuple[float, float]] | None = None) -> str:
+    """Return the plan as a table, with what each stage is predicted to take once it is compiled."""
     lines = [f"{'stage':<10} {'what':<21} {'needed':>10} {'total':>10}  why"]
     lines += [f"{r.stage:<10} {r.what:<21} {r.needed:>10} {r.total:>10}  {r.reason}" for r in rows]
+    lines += [
+        f"{stage:<10} about {seconds:.2g} seconds, {mebi:.0f} MiB" for stage, (seconds, mebi) in (cost or {}).items()
+    ]
     return "\n".join(lines)
+
+
+def predict_cost(kept: RawSamples, grid: Grid, options: RunOptions, needs: Needs) -> dict[str, tuple[float, float]]:
+    """Predict seconds (compiled, on two cores) and memory [MiB] by stage, from operation counts.
+
+    Rates were measured on two cores of a server; they tell a scene from a full run, and hours from seconds.
+    """
+    lanes, nodes = int(needs.wavelength.sum()), int(needs.node[:, :, : grid.num_azimuths].sum())
+    cell_lanes = nodes * lanes
+    cost = {}
+    if options.resample.method == "guided":
+        centres = min(kept.num_samples, MOST_CENTRES)
+        cost["estimate"] = (0.2 + 5e-10 * centres**3, 3 * 8 * centres**2 / MEBI)
+        variance = nodes * centres * (centres + FEATURES) * 2
+        seconds = 0.05 + 2 * centres**2 * lanes * 60 / RATE + variance / RATE + cell_lanes * 4e-7
+        cost["resample"] = (seconds, (8 * (2 * centres**2 + 4 * cell_lanes)) / MEBI)
+    else:
+        unknowns = grid.num_unknowns
+        inverse = unknowns if unknowns <= MAX_UNKNOWNS else 0
+        cost["resample"] = (0.5 * inverse**3 / RATE + unknowns**2 * lanes * 40 / RATE, 16 * inverse**2 / MEBI)
+    cost["represent"] = (0.05 + 0.11 * nodes / NODES_OF_A_HEMISPHERE, 40 * cell_lanes / MEBI)
+    cost["measure"] = (0.2 + cell_lanes * 5e-6, 16 * cell_lanes / MEBI)
+    return cost

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
 
     ready = prepare(raw, options)
     if args.plan:
-        print(plan_text(ready.rows))
+        print(plan_text(ready.rows, ready.cost))
         return 0
     output = Path(options.output.path)
     with open_progress(output) as progress, before_stopping(lambda word: progress.log(f"stopped: {word}")):

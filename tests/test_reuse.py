@@ -1,0 +1,143 @@
+"""What an earlier result holds is not computed again, and is the same."""
+
+import numpy as np
+import pytest
+from problems import scattered_samples
+
+import sbrdf_jax.pipeline
+import sbrdf_jax.resampling.guided as guided
+from sbrdf_jax.cli import main
+from sbrdf_jax.config import parse_config, resolve
+from sbrdf_jax.formats import write_samples
+from sbrdf_jax.store import load
+
+GRID = ["grid.theta_i_step_deg=22.5", "grid.theta_o_step_deg=22.5", "grid.phi_o_step_deg=45", "output.report=false"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a measurement, its config, and a result of three of its wavelengths."""
+    folder = tmp_path_factory.mktemp("reuse")
+    samples = scattered_samples(np.random.default_rng(3), [0.0, 30.0, 60.0, 80.0], 60, 9)
+    write_samples(folder / "small.csv", samples)
+    (folder / "config.yaml").write_text("input: {path: small.csv}\n")
+    assert main(command(folder, "some.h5", scene_of(samples.wavelength_nm[[1, 4, 7]]))) == 0
+    return folder
+
+
+def scene_of(wavelength_nm) -> str:
+    return f"scene={{wavelength_nm: {list(map(float, wavelength_nm))}}}"
+
+
+def command(folder, output: str, *overrides: str, earlier: str | None = None) -> list[str]:
+    resume = [] if earlier is None else [f"runtime.resume_from={folder / earlier}"]
+    return ["run", str(folder / "config.yaml"), *GRID, f"output.path={folder / output}", *resume, *overrides]
+
+
+@pytest.fixture
+def solved(monkeypatch):
+    """How many wavelengths each call of the solver was given, and how often a whole measurement was estimated."""
+    counts: dict[str, list[int]] = {"solved": [], "estimated": []}
+    solve, estimate = guided.solve_field, guided.estimate
+
+    def count_solved(estimates, centres, needed, tolerance):
+        counts["solved"].append(int(needed.sum()))
+        return solve(estimates, centres, needed, tolerance)
+
+    def count_estimated(*args):
+        counts["estimated"].append(1)
+        return estimate(*args)
+
+    monkeypatch.setattr(guided, "solve_field", count_solved)
+    monkeypatch.setattr(guided, "estimate", count_estimated)
+    return counts
+
+
+def test_another_target_recomputes_the_representation_only(folder, solved):
+    some = load(folder / "some.h5")
+    nm = some.gridded.wavelength_nm
+    more = ["represent.target={numbers: 100}"]
+    assert main(command(folder, "target.h5", scene_of(nm), *more, earlier="some.h5")) == 0
+    found = load(folder / "target.h5")
+    assert solved == {"solved": [], "estimated": []}
+    np.testing.assert_array_equal(found.gridded.brdf, some.gridded.brdf)
+    np.testing.assert_array_equal(found.gridded.standard_error, some.gridded.standard_error)
+    assert found.metrics["compression_ratio"] != some.metrics["compression_ratio"]
+
+
+def test_more_wavelengths_compute_what_is_new(folder, solved):
+    some = load(folder / "some.h5")
+    nm = load_wavelengths(folder)
+    assert main(command(folder, "more.h5", scene_of(nm[1:8]), earlier="some.h5")) == 0
+    assert solved == {"solved": [4], "estimated": []}
+    assert main(command(folder, "alone.h5", scene_of(nm[1:8]))) == 0
+    found, alone = load(folder / "more.h5").gridded, load(folder / "alone.h5").gridded
+    np.testing.assert_array_equal(found.wavelength_nm, nm[1:8])
+    np.testing.assert_array_equal(found.brdf[..., [0, 3, 6]], some.gridded.brdf)
+    for name in ("brdf", "standard_error"):
+        wanted = getattr(alone, name)
+        np.testing.assert_allclose(getattr(found, name), wanted, rtol=0, atol=1e-9 * wanted.max())
+    np.testing.assert_allclose(found.field.half, alone.field.half, rtol=0, atol=1e-9)
+
+
+def test_fewer_of_a_result_are_taken_from_it(folder, solved):
+    nm = load_wavelengths(folder)
+    scene = f"scene={{theta_i_deg: [45], wavelength_nm: [{nm[4]}]}}"
+    assert main(command(folder, "fewer.h5", scene, earlier="some.h5")) == 0
+    found, some = load(folder / "fewer.h5").gridded, load(folder / "some.h5").gridded
+    assert solved == {"solved": [], "estimated": []}
+    np.testing.assert_array_equal(found.brdf, some.brdf[2:3, ..., 1:2])
+
+
+def test_another_grid_keeps_the_fit(folder, solved):
+    nm = load(folder / "some.h5").gridded.wavelength_nm
+    finer = ["grid.phi_o_step_deg=30"]
+    assert main(command(folder, "finer.h5", scene_of(nm), *finer, earlier="some.h5")) == 0
+    assert solved["estimated"] == [] and sum(solved["solved"]) == 0
+    assert load(folder / "finer.h5").gridded.brdf.shape[2] == 13
+
+
+def test_a_change_of_output_recomputes_nothing(folder, solved, monkeypatch):
+    nm = load(folder / "some.h5").gridded.wavelength_nm
+
+    def refuse(*_args, **_kwargs):
+        raise AssertionError("computed again")
+
+    for stage in ("resample", "represent_with_plan", "encode_field", "measure"):
+        monkeypatch.setattr(sbrdf_jax.pipeline, stage, refuse)
+    assert main(command(folder, "same.h5", scene_of(nm), earlier="some.h5")) == 0
+    found, some = load(folder / "same.h5"), load(folder / "some.h5")
+    np.testing.assert_array_equal(found.gridded.brdf, some.gridded.brdf)
+    np.testing.assert_array_equal(found.compact.core, some.compact.core)
+    assert f"resume_from: {folder / 'some.h5'}" in found.config
+
+
+def test_method_paper_takes_over_wavelengths(folder):
+    paper = ["resample.method=paper"]
+    nm = load_wavelengths(folder)
+    assert main(command(folder, "paper1.h5", scene_of(nm[:4]), *paper)) == 0
+    assert main(command(folder, "paper2.h5", scene_of(nm[2:7]), *paper, earlier="paper1.h5")) == 0
+    first, second = load(folder / "paper1.h5").gridded, load(folder / "paper2.h5").gridded
+    np.testing.assert_array_equal(second.brdf[..., :2], first.brdf[..., 2:])
+    assert np.isfinite(second.brdf).all() and (second.kkt_residual <= 1e-8).all()
+
+
+def test_what_cannot_be_reused_is_said(folder, capsys, solved):
+    nm = load_wavelengths(folder)
+    other = ["resample.smoothness_weight=0.01"]
+    assert main(command(folder, "other.h5", scene_of(nm[:3]), *other, earlier="some.h5")) == 0
+    assert "nothing of it is used" in " ".join(load(folder / "other.h5").warnings) and solved["solved"] == [3]
+    capsys.readouterr()
+    assert main(command(folder, "none.h5", earlier="nowhere.h5")) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "runtime.resume_from" in error and "no such file" in error
+
+
+def load_wavelengths(folder) -> np.ndarray:
+    """All wavelengths of the measurement."""
+    return np.asarray(load(folder / "some.h5").plan["scene"]["wavelength_nm"])
+
+
+def test_the_reused_options_are_those_that_were_stored(folder):
+    config = load(folder / "some.h5").config
+    assert resolve(parse_config(config)).output.path == str(folder / "some.h5")
