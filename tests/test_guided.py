@@ -25,7 +25,8 @@ from sbrdf_jax.resampling.guided.coordinates import exchanged, from_log, guided_
 from sbrdf_jax.resampling.guided.covariance import covariance, node_values, prior_variance
 from sbrdf_jax.resampling.guided.error_model import MAX_FACTOR, estimate_floor, noise_factors
 from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out, lower_inverse, mirror_lower
-from sbrdf_jax.resampling.guided.lobe_model import LobeModel, fit_lobe_model, lobe_log_value, lobe_terms
+from sbrdf_jax.resampling.guided.lobe_fit import fit_lobe_model
+from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value, lobe_terms
 from sbrdf_jax.resampling.guided.merging import merge_samples
 from sbrdf_jax.resampling.guided.nodes import GRIDS, interpolate, mirror, mode_variance
 from sbrdf_jax.resampling.guided.smoothing import CONSTANT, PRIOR

@@ -78,9 +78,9 @@ def exchanged(at: Coordinates) -> Coordinates:
     return dataclasses.replace(at, theta_i=at.theta_o, theta_o=at.theta_i)
 
 
-def floored_cos(theta: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Cosine of a polar angle [rad], at least cos 85 degrees."""
-    return jnp.maximum(jnp.cos(theta), COS_FLOOR)
+def floored_cos(theta, xp=jnp):
+    """Cosine of polar angles [rad], at least cos 85 degrees, by JAX or NumPy as `xp`."""
+    return xp.maximum(xp.cos(theta), COS_FLOOR)
 
 
 @jax.jit

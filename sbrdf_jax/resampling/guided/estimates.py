@@ -22,7 +22,8 @@ from sbrdf_jax.resampling.guided.error_model import (
 )
 from sbrdf_jax.resampling.guided.field import GuidedField
 from sbrdf_jax.resampling.guided.inverse import leave_group_out, lower_product, mirror_lower, whitener
-from sbrdf_jax.resampling.guided.lobe_model import LobeModel, density_weights, fit_lobe_model, lobe_log_value
+from sbrdf_jax.resampling.guided.lobe_fit import density_weights, fit_lobe_model
+from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
 from sbrdf_jax.resampling.guided.nodes import ModeVariance
 from sbrdf_jax.resampling.guided.smoothing import choose_smoothing
 
