@@ -70,7 +70,7 @@ def measure(
     """
     value, warnings = measure_grid(gridded, absolute=absolute, seed=seed)
     if compact is not None:
-        value |= error_between(compact, gridded) | compression(compact, float(needed_nodes(gridded).mean()))
+        value |= error_between(compact, gridded) | compression(compact)
         live = live_wavelengths(gridded)
         if matching is None:
             matching = colour.colour_matching(np.asarray(gridded.wavelength_nm)[live])
@@ -285,14 +285,14 @@ def stored_numbers(compact: CompactBRDF | LobeTensor) -> int:
     return held + np.size(compact.basis.wavelength_nm) + num_coefficients + num_harmonics + vectors
 
 
-def compression(compact: CompactBRDF | LobeTensor, needed_share: float = 1.0) -> dict:
+def compression(compact: CompactBRDF | LobeTensor) -> dict:
     """Numbers of the grid at the paper's 13 x 49 x wavelengths an incident angle over the numbers of the compact form.
 
     Only 13 x 49 - 60 of those directions are distinct, and half of them are mirror images.
     `compression_ratio` counts everything that is stored; `compression_ratio_paper` only
     harmonics, height and width, as the paper does, of its form alone.
     """
-    grid = needed_share * PAPER_DIRECTIONS * np.size(compact.basis.wavelength_nm)
+    grid = PAPER_DIRECTIONS * np.size(compact.basis.wavelength_nm)
     everything = {"compression_ratio": np.size(compact.theta_i) * grid / stored_numbers(compact)}
     if isinstance(compact, LobeTensor):
         return everything

@@ -96,8 +96,7 @@ def represent(
     functions = num_i, min(len(theta_o), MOST_FUNCTIONS), num_direction_functions(floor)
     num_wavelengths = np.size(field.basis.wavelength_nm)
     layout = Layout(len(theta_i), functions, num_wavelengths, field.basis.kind == "data")
-    share = 1.0 if gridded is None or gridded.needed is None else float(np.mean(gridded.needed))
-    target = make_target(options.target, len(theta_i), num_wavelengths, budget, share)
+    target = make_target(options.target, len(theta_i), num_wavelengths, budget)
     finite = np.isfinite(brdf).all(axis=3)
     if gridded is not None and gridded.needed is not None:
         finite |= ~np.asarray(gridded.needed)
@@ -177,7 +176,10 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
         return bool(target.stops) and all(is_met(stop, measure(stop, factors)) for stop in target.stops)
 
     first = min(2, count) if layout.stores_vectors else count
-    factors = grow(fit, layout.numbers, target.budget, is_enough, first_channels=first)
+    # what whole hemispheres may cost is too much for a part of them, but for the spectra that all share
+    spectra = vectors.size if layout.stores_vectors else 0
+    most = min(target.budget, spectra + np.mean(nodes.needed) * target.budget)
+    factors = grow(fit, layout.numbers, most, is_enough, first_channels=first)
     achieved, used = measure(target, factors), factors.core.shape[3]
     basis = vector_basis(field.basis.wavelength_nm, vectors[:used]) if layout.stores_vectors else field.basis
     return factors._replace(core=factors.core @ to_coefficient[:used, :used]), log_scale, basis, achieved

@@ -40,12 +40,10 @@ def make_target(
     num_theta_i: int,
     num_wavelengths: int,
     budget: ErrorBudget | None = None,
-    needed_share: float = 1.0,
 ) -> Target:
     """Return the target that the options give, for a grid; of a target and a scene's budget the stricter.
 
-    A ratio counts the share of the nodes that a scene needs. A budget of numbers and one of
-    error hold both: what is reached first ends the search.
+    A budget of numbers and one of error hold both: what is reached first ends the search.
     """
     kind, value = _given(options)
     enough = {kind: value} if kind in ("error", "delta_e") else {}
@@ -57,7 +55,7 @@ def make_target(
         else:
             enough[name] = limit
     most = {
-        "ratio": needed_share * num_theta_i * PAPER_DIRECTIONS * num_wavelengths / value,
+        "ratio": num_theta_i * PAPER_DIRECTIONS * num_wavelengths / value,
         "numbers": num_theta_i * value,
     }.get(kind, float("inf"))
     return Target(kind, float(value), float(most), tuple(enough.items()))
