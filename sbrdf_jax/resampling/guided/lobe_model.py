@@ -29,7 +29,7 @@ LOWER = np.array([np.log(0.2), np.log(0.0087), np.log(0.03), np.log(0.1), 0.0, 0
 UPPER = np.array([np.log(2.0), np.log(0.02), np.log(0.25), np.log(1.0), 1.5, 1.5, 1.5, 1.5, 1.0])
 PRIOR_WEIGHT = 2e-4  # of the whole data weight, per squared spread
 LOSS_SCALE = 0.3  # residual in z where the soft-L1 loss turns from square to linear
-LOG_AMPLITUDE_RANGE = (np.log(1e-8), np.log(1e8))
+LOG_AMPLITUDE_RANGE = np.log([1e-6, 1e10])  # over the floor, so that units do not matter
 DENSITY_WIDTH = 0.2  # Gaussian width in log(theta_h[deg] + 1) of the sample density
 SHAPE_STEPS, AMPLITUDE_STEPS = 30, 15
 STOP = 1e-5  # relative decrease of the loss
@@ -113,6 +113,7 @@ def _minimise(model, at, z, weight, floor, *, fit_shape: bool, max_steps: int) -
     """
     num = z.shape[1]
     scale = log_scale(at, floor)[:, None]
+    lowest, highest = jnp.log(floor) + LOG_AMPLITUDE_RANGE
     prior_weight = jnp.asarray(PRIOR_WEIGHT * num / PRIOR_SPREAD**2) * weight.sum() * float(fit_shape)
 
     def step(state: _State) -> _State:
@@ -141,7 +142,7 @@ def _minimise(model, at, z, weight, floor, *, fit_shape: bool, max_steps: int) -
         else:
             shape = model.shape
             change = -jnp.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
-        log_amplitude = jnp.clip(model.log_amplitude + jnp.clip(change.T, -3.0, 3.0), *LOG_AMPLITUDE_RANGE)
+        log_amplitude = jnp.clip(model.log_amplitude + jnp.clip(change.T, -3.0, 3.0), lowest, highest)
         trial = LobeModel(shape=shape, log_amplitude=log_amplitude)
         loss = _loss(_residual(trial, lobe_terms(shape, at), z, scale)[0], weight, shape, prior_weight)
         better = loss < state.loss
@@ -174,19 +175,19 @@ def density_weights(half: np.ndarray) -> np.ndarray:
     return weight / weight.mean()
 
 
-def _start(value: np.ndarray, at: Coordinates, used: np.ndarray) -> np.ndarray:
+def _start(value: np.ndarray, at: Coordinates, used: np.ndarray, floor: float) -> np.ndarray:
     """Starting log amplitudes [4, wavelength] from medians of ratios in rings of theta_h."""
     terms = np.asarray(lobe_terms(jnp.asarray(PRIOR), at))[used]
     theta_h = np.expm1(np.asarray(at.half))[used]  # deg
     value = value[used]
-    tiny = 1e-6 * max(float(np.median(value[value > 0])), 1e-12)
+    tiny = 1e-6 * float(np.median(value[value > 0]))
     diffuse = np.maximum(np.median(value / terms[:, :1], axis=0), tiny)
     rows = [diffuse]
     for term, low, high, share in ((1, 0.0, 1.0, 1.0), (2, 2.0, 8.0, 0.5), (3, 8.0, 20.0, 0.5)):
         ring = (theta_h >= low) & (theta_h < high)
         excess = np.maximum(value[ring] - diffuse * terms[ring, :1], 0.0) / terms[ring, term : term + 1]
         rows.append(np.maximum(share * np.median(excess, axis=0), tiny) if ring.any() else np.full_like(diffuse, tiny))
-    return np.clip(np.log(np.stack(rows)), *LOG_AMPLITUDE_RANGE)
+    return np.clip(np.log(np.stack(rows)), *(np.log(floor) + LOG_AMPLITUDE_RANGE))
 
 
 def fit_lobe_model(
@@ -206,7 +207,7 @@ def fit_lobe_model(
     Returns:
         The model, and per wavelength the relative norm of the loss's gradient by its log amplitudes.
     """
-    amplitude = _start(value, at, weight > 0)
+    amplitude = _start(value, at, weight > 0, floor)
     every = max(1, z.shape[1] // NUM_FIT_WAVELENGTHS)
     model = LobeModel(shape=jnp.asarray(PRIOR), log_amplitude=jnp.asarray(amplitude[:, ::every]))
     given = (jnp.asarray(weight), jnp.asarray(floor))
