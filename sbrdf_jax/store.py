@@ -21,6 +21,7 @@ from sbrdf_jax.compact_layout import read_compact, write_compact
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.files import whole_file
 from sbrdf_jax.hdf5 import (
+    FORMAT,
     attribute,
     dataset,
     dataset_of,
@@ -73,7 +74,7 @@ def save(path: str | os.PathLike, result: RunResult) -> None:
     Raises:
         UserError: the path cannot be written.
     """
-    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+    with whole_file(path) as temporary, h5py.File(temporary, "w", libver=FORMAT) as file:
         write_result(file, result)
 
 
@@ -170,6 +171,7 @@ def _read_grid(file: h5py.File) -> GriddedBRDF:
     return read_grid(group_of(file, "grid"), group_of(file, "field") if "field" in file else None)
 
 
+@one_line_errors
 def describe(path: str | os.PathLike) -> list[str]:
     """Describe a result in lines for a user: what the file is, then the tables of its summary.
 
