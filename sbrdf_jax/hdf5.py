@@ -1,8 +1,10 @@
 """HDF5 as this project writes it: units, dimension scales, chunks, no time stamps; and a wary reader of it."""
 
+import contextlib
 import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -11,10 +13,29 @@ import numpy as np
 from sbrdf_jax.errors import UserError
 
 CHUNKED_FROM = 2  # dimensions
+GROWTH = 2**22  # bytes; a file in memory grows by so much
 LARGEST_COMPACT = 2**15  # bytes; datasets up to it lie in their own header, whose checksum covers them
 FORMAT = ("v110", "v110")  # of HDF5: the oldest whose every header has a checksum, so that damage is told, not followed
 LONGEST_REASON = 200  # characters of an error that quotes a file
 MOST_EXPANSION = 1000  # a dataset may declare at most this many times what it holds, or the file is refused
+
+
+@contextlib.contextmanager
+def file_in_memory(path: Path) -> Iterator[h5py.File]:
+    """Yield an empty HDF5 file; what is written to it reaches the disk at the end, in one piece.
+
+    On a full disk the HDF5 library fails again at every later call, that of the interpreter's end included; here
+    Python writes the file, and fails once.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    options: dict[str, Any] = {"driver": "core", "backing_store": False, "block_size": GROWTH, "libver": FORMAT}
+    with h5py.File(path, "w", **options) as file:
+        yield file
+        file.flush()
+        image = file.id.get_file_image()
+    path.write_bytes(image)
 
 
 def degrees(angle) -> np.ndarray:

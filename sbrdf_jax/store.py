@@ -21,11 +21,11 @@ from sbrdf_jax.compact_layout import read_compact, write_compact
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.files import whole_file
 from sbrdf_jax.hdf5 import (
-    FORMAT,
     attribute,
     dataset,
     dataset_of,
     degrees,
+    file_in_memory,
     group_of,
     one_line_errors,
     read_datasets,
@@ -74,7 +74,7 @@ def save(path: str | os.PathLike, result: RunResult) -> None:
     Raises:
         UserError: the path cannot be written.
     """
-    with whole_file(path) as temporary, h5py.File(temporary, "w", libver=FORMAT) as file:
+    with whole_file(path) as temporary, file_in_memory(temporary) as file:
         write_result(file, result)
 
 
