@@ -24,7 +24,7 @@ def quick() -> Suite:
 
     case = pipeline.Case(samples=750, step_deg=15.0, wavelengths=8)
     return {
-        "resampling": lambda: error_time.records("amber_glass", lanes=2, step_deg=15.0, steps=(100, 1000), repeats=2),
+        "resampling": lambda: error_time.records("amber_glass", lanes=2, step_deg=15.0, steps=(300,), repeats=2),
         "interpolation": lambda: interpolation.records(
             "amber_glass", samples=700, wavelengths=8, folds=1, step_deg=15.0
         ),

@@ -44,7 +44,8 @@ def osqp_solver(matrix: np.ndarray, rhs: np.ndarray) -> Callable[[float], np.nda
             limits = {"l": np.zeros(size), "u": np.full(size, np.inf)}
             settings = {"eps_abs": tolerance, "eps_rel": tolerance, "max_iter": 20_000, "verbose": False}
             problem.setup(P=upper, q=-column, A=identity, **limits, **settings)
-            columns.append(problem.solve().x)
+            found = problem.solve()
+            columns.append(np.where(-found.y > found.x, 0.0, found.x))  # at the bound, where its multiplier says so
         return np.stack(columns, axis=1)
 
     return solve

@@ -22,10 +22,11 @@ def draw(records: list[Record], folder: str | Path) -> list[Path]:
         for axes, problem in zip(panels[0], problems, strict=True):
             of_problem = [record for record in some if record.problem == problem]
             for method, marker in zip(unique(r.method for r in of_problem), "os^Dvx*P<>hp1234" * 4, strict=False):
-                line = sorted((r.seconds_min, r.error) for r in of_problem if r.method == method)
+                line = sorted((r.seconds_min, _height(r)) for r in of_problem if r.method == method)
                 axes.loglog(*zip(*line, strict=True), marker=marker, markersize=4, linewidth=1, label=method)
             axes.set_xlabel("seconds, warm")
-            axes.set_ylabel(of_problem[0].error_kind)
+            is_solver = of_problem[0].kkt_residual is not None
+            axes.set_ylabel("relative KKT residual" if is_solver else of_problem[0].error_kind)
             axes.set_title(problem)
             axes.grid(True, which="major", alpha=0.3)
             axes.legend(fontsize=7)
@@ -33,6 +34,11 @@ def draw(records: list[Record], folder: str | Path) -> list[Path]:
         figure.savefig(paths[-1], dpi=120)
         plt.close(figure)
     return paths
+
+
+def _height(record: Record) -> float:
+    """What is drawn: the residual of a solver, because its error is mostly that of the grid."""
+    return record.error if record.kkt_residual is None else record.kkt_residual
 
 
 def main() -> None:
