@@ -22,16 +22,14 @@ def quick() -> Suite:
     """The groups of the quick suite: small, on the embedded sample."""
     from benchmarks import compact, error_time, interpolation, lobe_fits, pipeline
 
-    case = pipeline.Case(samples=750, step_deg=15.0, wavelengths=8)
+    name, step_deg = "amber_glass", 15.0
+    case = pipeline.Case("paper", samples=750, step_deg=step_deg, wavelengths=8)
+    size = {"sizes": (107,), "repeats": 1, "with_paper": False}
     return {
-        "resampling": lambda: error_time.records("amber_glass", lanes=2, step_deg=15.0, steps=(300,), repeats=2),
-        "interpolation": lambda: interpolation.records(
-            "amber_glass", samples=700, wavelengths=8, folds=1, step_deg=15.0
-        ),
+        "resampling": lambda: error_time.records(name, lanes=2, step_deg=step_deg, steps=(300,), repeats=2),
+        "interpolation": lambda: interpolation.records(name, samples=700, wavelengths=8, folds=1, step_deg=step_deg),
         "lobes": lambda: lobe_fits.records(2000, loop_lanes=100),
-        "representation": lambda: compact.records(
-            "amber_glass", sizes=(107, 214), step_deg=15.0, repeats=1, with_paper=False
-        ),
+        "representation": lambda: compact.records(name, step_deg=step_deg, **size),
         "pipeline": lambda: pipeline.records([case]),
     }
 

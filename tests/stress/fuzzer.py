@@ -25,40 +25,62 @@ LIES_SHARE = 0.3  # of HDF5 inputs are sound files with hostile content
 LONGEST_MESSAGE = 700
 
 
-def readers() -> dict:
-    """Return (text or not, function that reads a path) by kind; imported here, because each needs other packages."""
-    import jax
-
+def read_measurement(path):
+    """Read samples, and look whether they can be some."""
     from sbrdf_jax import formats
-    from sbrdf_jax.commands.evaluate import read_directions
-    from sbrdf_jax.config import load_config, resolve
-    from sbrdf_jax.folds import read_fold_file
     from sbrdf_jax.options import InputOptions
 
-    def measurement(path):
-        found = formats.read(path, InputOptions(path="unused"))
-        assert found.value.shape == (found.num_samples, len(found.wavelength_nm)) and found.num_samples >= 4
-        assert (found.wavelength_nm > 0).all() and not (np.abs(found.theta_i) > math.pi / 2 + 1e-4).any()
+    found = formats.read(path, InputOptions(path="unused"))
+    assert found.value.shape == (found.num_samples, len(found.wavelength_nm)) and found.num_samples >= 4
+    assert (found.wavelength_nm > 0).all() and not (np.abs(found.theta_i) > math.pi / 2 + 1e-4).any()
 
-    def result(path):
-        from sbrdf_jax.store import describe, load
 
-        found = load(path)
-        grid = found.gridded
-        assert np.shape(grid.brdf) == tuple(map(len, (grid.theta_i, grid.theta_o, grid.phi_o, grid.wavelength_nm)))
-        describe(path)
-        arrays = [leaf for stage in (grid, found.compact, found.field) for leaf in jax.tree.leaves(stage)]
-        return [np.asarray(array).tobytes() for array in arrays]
+def read_result(path) -> list[bytes]:
+    """Read and describe a result; return all its numbers."""
+    import jax
 
-    def config(path):
-        resolve(load_config(path))
+    from sbrdf_jax.store import describe, load
 
-    texts = {"pbrt": measurement, "csv": measurement, "nist": measurement, "config": config}
-    texts |= {"directions": read_directions, "folds": lambda path: read_fold_file(str(path), 5)}
-    return {kind: (True, read) for kind, read in texts.items()} | {
-        "raw_hdf5": (False, measurement),
-        "result": (False, result),
-    }
+    found = load(path)
+    grid = found.gridded
+    assert np.shape(grid.brdf) == tuple(map(len, (grid.theta_i, grid.theta_o, grid.phi_o, grid.wavelength_nm)))
+    describe(path)
+    arrays = [leaf for stage in (grid, found.compact, found.field) for leaf in jax.tree.leaves(stage)]
+    return [np.asarray(array).tobytes() for array in arrays]
+
+
+def read_config(path):
+    """Read and resolve a config."""
+    from sbrdf_jax.config import load_config, resolve
+
+    resolve(load_config(path))
+
+
+def read_evaluated_directions(path):
+    """Read the directions of `sbrdf evaluate`."""
+    from sbrdf_jax.commands.evaluate import read_directions
+
+    read_directions(path)
+
+
+def read_folds(path):
+    """Read given folds."""
+    from sbrdf_jax.folds import read_fold_file
+
+    read_fold_file(str(path), 5)
+
+
+READERS = {
+    "pbrt": read_measurement,
+    "csv": read_measurement,
+    "nist": read_measurement,
+    "raw_hdf5": read_measurement,
+    "result": read_result,
+    "config": read_config,
+    "directions": read_evaluated_directions,
+    "folds": read_folds,
+}
+BINARY = ("raw_hdf5", "result")
 
 
 def outcome(read, path: Path, sound=None) -> str | None:
@@ -85,7 +107,7 @@ def outcome(read, path: Path, sound=None) -> str | None:
 def main(kind: str, first: int, count: int, folder: Path) -> int:
     """Read inputs `first` to `first + count` of a kind; the seed files lie in FOLDER/seeds."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    is_text, read = readers()[kind]
+    is_text, read = kind not in BINARY, READERS[kind]
     seeds = sorted((folder / "seeds").glob(f"{kind}*"))
     contents = [seed.read_bytes() for seed in seeds]
     path, progress = folder / "input", os.open(folder / "at", os.O_CREAT | os.O_RDWR)

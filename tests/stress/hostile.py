@@ -137,7 +137,7 @@ def _repeats(rng, usual) -> list[HostileProblem]:
     return [
         HostileProblem("every sample four times", few, smooth_field, loose, own_shape=guided),
         HostileProblem("near-duplicates that disagree by 1 %", near, smooth_field, loose, own_shape=guided),
-        HostileProblem("next to no smoothing", usual, **singular),
+        HostileProblem("next to no smoothing", usual, **singular, own_shape=guided),  # its steps are of another kind
         HostileProblem("next to no smoothing, duplicates", near, **singular, own_shape=guided),
     ]
 

@@ -20,6 +20,7 @@ from writers import result_of, write_as_another_user, write_for_ever, write_on_a
 from sbrdf_jax.formats import write_samples
 from sbrdf_jax.store import load, save
 
+KILLS_OF_A_RUN = 50
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(["writers"])  # a process starts in milliseconds then
 
@@ -100,23 +101,24 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
 
 @pytest.fixture(scope="module")
 def words(tmp_path_factory):
-    """A run of a small measurement, with compiled code kept, and the seconds that a whole one takes."""
+    """The command and environment of a run of a small measurement, with compiled code kept."""
     folder = tmp_path_factory.mktemp("faults")
     write_samples(folder / "small.csv", scattered_samples(np.random.default_rng(3), [0.0, 30.0, 60.0, 80.0], 40, 5))
     (folder / "config.yaml").write_text("input: {path: small.csv}\n")
     environment = os.environ | {"PYTHONPATH": str(ROOT), "SBRDF_COMPILE_CACHE": str(folder / "cache")}
     command = [sys.executable, "-m", "sbrdf_jax.run", str(folder / "config.yaml"), *FAST, "output.overwrite=true"]
-    for _ in range(2):
-        start = time.monotonic()
-        subprocess.run([*command, f"output.path={folder}/x.h5"], env=environment, check=True, capture_output=True)
-    return command, environment, time.monotonic() - start
+    return command, environment
 
 
-@pytest.mark.parametrize("kills", [3, pytest.param(50, marks=pytest.mark.slow)])
-def test_a_run_killed_at_random_leaves_no_half_file_and_runs_again(kills, words, tmp_path):
-    command, environment, seconds = words
+@pytest.mark.slow
+def test_a_run_killed_at_random_leaves_no_half_file_and_runs_again(words, tmp_path):
+    command, environment = words
     rng, output = random.Random(6), tmp_path / "x.h5"
-    for _ in range(kills):
+    for _ in range(2):  # the second time with compiled code
+        start = time.monotonic()
+        subprocess.run([*command, f"output.path={output}"], env=environment, check=True, capture_output=True)
+        seconds = time.monotonic() - start
+    for _ in range(KILLS_OF_A_RUN):
         process = subprocess.Popen(
             [*command, f"output.path={output}"], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
@@ -156,7 +158,7 @@ def at_a_terminal(command, environment, log, act):
 
 @pytest.mark.parametrize(("act", "code"), [("interrupt", 130), ("hang up", -signal.SIGHUP)])
 def test_an_interrupted_or_lost_terminal_leaves_nothing_half_written(act, code, words, tmp_path):
-    command, environment, _ = words
+    command, environment = words
     acts = {"interrupt": lambda terminal: os.write(terminal, b"\x03"), "hang up": os.close}
     output = tmp_path / "x.h5"
     fine = ["grid.theta_o_step_deg=7.5", "grid.phi_o_step_deg=7.5"]  # not compiled yet: it takes a while

@@ -17,8 +17,8 @@ from sbrdf_jax import store
 from sbrdf_jax.cleaning import clean
 
 MANY = 100_000
-DEFAULT = {"pbrt": 3000, "csv": 3000, "nist": 3000, "config": 400, "directions": 3000, "folds": 3000}
-DEFAULT |= {"raw_hdf5": 400, "result": 400}  # a child process reads these, or an HDF5 file is opened three times
+DEFAULT = {"pbrt": 2000, "csv": 2000, "nist": 2000, "config": 300, "directions": 2000, "folds": 2000}
+DEFAULT |= {"raw_hdf5": 300, "result": 300}  # a child process reads these, or an HDF5 file is opened three times
 CONFIG = """input: {path: a.csv, format: csv, scale: 2.0}  # a comment
 grid:
   theta_i_step_deg: 7.5
