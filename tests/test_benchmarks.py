@@ -1,6 +1,7 @@
 """The harness of the benchmarks: what a record must hold, and what is made of records; no time is ever asserted."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,8 @@ def test_a_record_holds_a_finite_time_and_error():
     assert record.compile_seconds == 1.0
     once = a_record(seconds=(2.0,))
     assert (once.seconds_min, once.compile_seconds, once.repeats) == (2.0, 0.0, 1)
-    for wrong in ({"error": np.nan}, {"error": np.inf}, {"seconds": (np.inf,)}):
+    many: tuple[dict[str, Any], ...] = ({"error": np.nan}, {"error": np.inf}, {"seconds": (np.inf,)})
+    for wrong in many:
         with pytest.raises(ValueError, match="must be finite"):
             a_record(**wrong)
 

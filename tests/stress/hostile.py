@@ -7,13 +7,15 @@ how far a sound answer may be from the truth.
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from typing import Any, Literal
 
 import numpy as np
 
 from sbrdf_jax.options import GridOptions
 from sbrdf_jax.records import RawSamples, Status
 
-METHODS = ("paper", "guided")
+Method = Literal["paper", "guided"]
+METHODS: tuple[Method, ...] = ("paper", "guided")
 GRID = GridOptions(theta_i_step_deg=15.0, theta_o_step_deg=15.0, phi_o_step_deg=30.0)
 INCIDENCES_DEG = (0.0, 20.0, 40.0, 60.0)
 NUM_DIRECTIONS = 50  # for each of them
@@ -72,8 +74,9 @@ def directions(
 
 def as_samples(angles, value, wavelength_nm=WAVELENGTH_NM) -> RawSamples:
     """Put angles [rad] and values into a record."""
-    row = np.arange(len(angles[0]))
-    return RawSamples(*angles, np.asarray(wavelength_nm, float), value, row, "brdf", "hostile", "builtin", "0" * 64)
+    theta_i, theta_o, phi_o = angles
+    wavelength_nm, row = np.asarray(wavelength_nm, float), np.arange(len(theta_i))
+    return RawSamples(theta_i, theta_o, phi_o, wavelength_nm, value, row, "brdf", "hostile", "builtin", "0" * 64)
 
 
 def measured(rng: np.random.Generator, angles=None, truth: Truth = smooth_field) -> RawSamples:
@@ -132,7 +135,7 @@ def _repeats(rng, usual) -> list[HostileProblem]:
     noisy = with_values(few, few.value * (1 + 1e-2 * rng.standard_normal(few.value.shape)))
     near = dataclasses.replace(noisy, theta_o=np.abs(few.theta_o + 1e-9 * rng.standard_normal(few.num_samples)))
     loose = {"paper": 0.4, "guided": 0.5}  # 50 directions are left
-    singular = {"smoothness_weight": {"paper": 1e-6, "guided": 1e-9}, "may_give_up": True}
+    singular: dict[str, Any] = {"smoothness_weight": {"paper": 1e-6, "guided": 1e-9}, "may_give_up": True}
     guided = ("guided",)  # its centres are the distinct directions
     return [
         HostileProblem("every sample four times", few, smooth_field, loose, own_shape=guided),

@@ -19,10 +19,10 @@ from sbrdf_jax.resampling import resample
 from sbrdf_jax.resampling.guided.centres import PADDING_NOISE
 from sbrdf_jax.resampling.guided.field import field_whitener
 from sbrdf_jax.resampling.normal import normal_equations
-from tests.stress.hostile import GRID, HIGHEST_DEG, HostileProblem, directions
+from tests.stress.hostile import GRID, HIGHEST_DEG, HostileProblem, Method, directions
 
 TOLERANCE = {"paper": 1e-8, "guided": 1e-6}
-WEIGHT = {"paper": 1.0, "guided": "data"}
+WEIGHT: dict[str, Any] = {"paper": 1.0, "guided": "data"}
 ENCODE = {"paper": EncodeOptions("fourier", 19), "guided": EncodeOptions("data", 12)}
 REPRESENT = {"paper": RepresentOptions("paper"), "guided": RepresentOptions("lobe_tensor")}
 
@@ -35,7 +35,7 @@ class Outcome(NamedTuple):
     compact: Any
 
 
-def solve(problem: HostileProblem, method: str) -> Outcome:
+def solve(problem: HostileProblem, method: Method) -> Outcome:
     """Run cleaning, resampling, encoding and representation.
 
     Raises:
@@ -49,7 +49,7 @@ def solve(problem: HostileProblem, method: str) -> Outcome:
     return Outcome(gridded, field, represent(field, REPRESENT[method], live))
 
 
-def options_of(problem: HostileProblem, method: str) -> ResampleOptions:
+def options_of(problem: HostileProblem, method: Method) -> ResampleOptions:
     """Options of the resampling of one problem."""
     weight = problem.smoothness_weight.get(method, WEIGHT[method])
     return ResampleOptions(method=method, smoothness_weight=weight, tolerance=TOLERANCE[method])
@@ -65,7 +65,7 @@ def forward_errors(problem: HostileProblem, gridded: GriddedBRDF) -> tuple[float
     return float(worst), float(np.median(np.abs(found - truth) / truth))
 
 
-def condition_number(problem: HostileProblem, method: str, gridded: GriddedBRDF) -> float:
+def condition_number(problem: HostileProblem, method: Method, gridded: GriddedBRDF) -> float:
     """Of the matrix that all wavelengths share: the scaled A'A, or the guided method's prior plus noise."""
     if method == "guided":
         root = np.linalg.inv(np.asarray(field_whitener(gridded.field)))

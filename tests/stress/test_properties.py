@@ -19,6 +19,7 @@ from sbrdf_jax.options import InputOptions, ResampleOptions
 from sbrdf_jax.records import GriddedBRDF, RawSamples, Status
 from sbrdf_jax.resampling import resample
 from sbrdf_jax.resampling.geometry import Geometry
+from sbrdf_jax.sinc import Window
 from tests.stress.hostile import GRID, NUM_DIRECTIONS, WAVELENGTH_NM, measured, with_values
 
 SOLVED = 1e-5  # relative change of an answer: the solver's tolerance 1e-8 times the condition number, about 1e3
@@ -35,7 +36,7 @@ def check(prove, examples: int, **strategies) -> None:
 GEOMETRY = Geometry()
 
 
-def fit(samples: RawSamples, *, weight: float = 1.0, window: str = "factor") -> GriddedBRDF:
+def fit(samples: RawSamples, *, weight: float = 1.0, window: Window = "factor") -> GriddedBRDF:
     """The field of method paper on the whole circle: samples of both half-planes."""
     options = ResampleOptions("paper", weight, window, tolerance=1e-8)
     found = resample(samples, make_grid(samples, GRID, bilateral=False), options, geometry=GEOMETRY)
@@ -49,7 +50,7 @@ def usual() -> RawSamples:
 
 
 @functools.cache
-def answer(window: str = "factor") -> GriddedBRDF:
+def answer(window: Window = "factor") -> GriddedBRDF:
     return fit(usual(), window=window)
 
 
