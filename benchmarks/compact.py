@@ -10,16 +10,19 @@ number takes 8 bytes.
 import argparse
 import dataclasses
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.compact_baselines import BASELINES
+from benchmarks.records import Record, record_of, timed
 from benchmarks.solver import CORNELL
 
 GLASSES = ("amber_glass", "amber_glass_sharp", "amber_glass_broad")
 SIZES = (64, 107, 214, 513)
 ERRORS = (0.045, 0.01)
+FEWEST = 20  # directions of an embedded sample, for its wavelengths alone
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -40,23 +43,75 @@ def main(arguments: list[str] | None = None) -> None:
 
 def gridded_field(name: str):
     """Return the grid stage of a measurement, or the truth of an embedded sample on the paper's grid."""
-    from sbrdf_jax.builtin import true_brdf
     from sbrdf_jax.config import parse_config, resolve
     from sbrdf_jax.formats import read
     from sbrdf_jax.pipeline import prepare
     from sbrdf_jax.resampling import resample
 
-    truth = name.removeprefix("true:")
-    path = name if Path(name).exists() else f"builtin:{truth}"
+    if name.startswith("true:"):
+        return true_grid(name.removeprefix("true:"))
+    path = name if Path(name).exists() else f"builtin:{name}"
     options = resolve(parse_config(f"input: {{path: '{path}'}}"))
     ready = prepare(read(options.input.path, options.input), options)
-    gridded = resample(ready.cleaned.samples, ready.grid, options.resample)
-    if truth == name:
-        return gridded
-    mesh = np.meshgrid(gridded.theta_i, gridded.theta_o, gridded.phi_o, indexing="ij")
-    brdf = np.asarray(true_brdf(truth, *mesh, np.asarray(gridded.wavelength_nm)))
-    flags = np.zeros(brdf.shape[:3], int)
-    return dataclasses.replace(gridded, brdf=brdf, extrapolated=flags, field=None, standard_error=None)
+    return resample(ready.cleaned.samples, ready.grid, options.resample)
+
+
+def true_grid(material: str, step_deg: float = 7.5):
+    """Return the truth of an embedded sample on a grid, as if all of it had been measured."""
+    from sbrdf_jax.builtin import measure as measure_builtin
+    from sbrdf_jax.builtin import true_brdf
+    from sbrdf_jax.records import GriddedBRDF
+
+    wavelength_nm = measure_builtin(material, count=FEWEST).wavelength_nm
+    axes = [np.deg2rad(np.linspace(0.0, stop, round(stop / step_deg) + 1)) for stop in (90.0, 90.0, 360.0)]
+    brdf = np.asarray(true_brdf(material, *np.meshgrid(*axes, indexing="ij"), wavelength_nm))
+    lanes = np.zeros(len(wavelength_nm))
+    return GriddedBRDF(*axes, wavelength_nm, brdf, np.zeros(brdf.shape[:3], int), lanes, lanes, lanes)
+
+
+def records(
+    material: str, *, sizes: tuple[int, ...] = SIZES, step_deg: float = 7.5, repeats: int = 2, with_paper: bool = True
+) -> Iterator[Record]:
+    """Yield a record for each form and size: the worst eta of eq. (18) over the incident angles of the truth."""
+    from sbrdf_jax.encoding import data_basis, encode_field, make_basis
+    from sbrdf_jax.evaluation import evaluate_on_axes
+    from sbrdf_jax.metrics import stored_numbers
+    from sbrdf_jax.options import RepresentOptions, TargetOptions
+    from sbrdf_jax.representation import represent
+
+    gridded = true_grid(material, step_deg)
+    brdf, wavelength_nm = np.asarray(gridded.brdf), np.asarray(gridded.wavelength_nm)
+    known, per_angle = np.ones(len(brdf), bool), len(brdf)
+    axes = gridded.theta_i, gridded.theta_o, gridded.phi_o
+    field = encode_field(gridded, data_basis(wavelength_nm, brdf, 12))
+
+    def record(method, size, numbers, found, timing):
+        eta = np.sqrt(((found - brdf) ** 2).sum(axis=(1, 2, 3)) / (brdf**2).sum(axis=(1, 2, 3)))
+        return record_of(
+            timing,
+            group="representation",
+            problem=f"true {material}, {step_deg:g} degrees",
+            method=method,
+            setting=size,
+            size={"incident angles": per_angle, "wavelengths": len(wavelength_nm)},
+            error=float(eta.max()),
+            error_kind="eta of eq. 18, worst incident angle",
+            more={"bytes per incident angle": 8 * numbers / per_angle, "median eta": float(np.median(eta))},
+        )
+
+    for size in sizes:
+        options = RepresentOptions(method="lobe_tensor", target=TargetOptions(numbers=size))
+        compact, timing = timed(lambda options=options: represent(field, options, gridded), repeats)
+        found = evaluate_on_axes(compact, *axes)
+        yield record("lobe_tensor", f"{size} numbers", stored_numbers(compact), found, timing)
+        for method, baseline in BASELINES.items():
+            (numbers, found), timing = timed(lambda b=baseline, size=size: b(brdf, known, size * per_angle), 0)
+            if found is not None:
+                yield record(method, f"{size} numbers", numbers, found, timing)
+    if with_paper:
+        series = encode_field(gridded, make_basis(wavelength_nm, "fourier", 19))
+        compact, timing = timed(lambda: represent(series, RepresentOptions("paper")), repeats)
+        yield record("paper", "L = 4", stored_numbers(compact), evaluate_on_axes(compact, *axes), timing)
 
 
 def measure(name: str, *, with_paper: bool) -> dict[str, list[tuple[float, float, float]]]:

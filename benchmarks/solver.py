@@ -28,8 +28,8 @@ TOLERANCE = 1e-8
 JAXOPT_STEPS = 3000
 
 
-def load(name: str):
-    """Return the cleaned samples and the 7.5-degree grid of a case; None where the file is absent."""
+def load(name: str, step_deg: float = 7.5):
+    """Return the cleaned samples and the grid of a case; None where the file is absent."""
     from sbrdf_jax.config import parse_config, resolve
     from sbrdf_jax.formats import read
     from sbrdf_jax.pipeline import prepare
@@ -37,7 +37,8 @@ def load(name: str):
     path = f"builtin:{name.split('_paper')[0]}" if name in AMBER else str(CORNELL / f"{name}.brdf")
     if name not in AMBER and not Path(path).exists():
         return None
-    text = f"input: {{path: '{path}', bilateral: true}}\nresample: {{method: paper}}\n"
+    grid = f"{{theta_i_step_deg: {step_deg}, theta_o_step_deg: {step_deg}, phi_o_step_deg: {step_deg}}}"
+    text = f"input: {{path: '{path}', bilateral: true}}\ngrid: {grid}\nresample: {{method: paper}}\n"
     options = resolve(parse_config(text))
     raw = read(path, options.input)
     if name in AMBER:

@@ -20,6 +20,7 @@ HORIZON_TOLERANCE = 1e-5  # rad; rounding in a text file puts 90 degrees at 1.57
 SAME_DIRECTION = 1e-6  # rad; the last digit that text files keep
 HALF_TURN_TOLERANCE = 1e-4  # rad; text files put pi at 3.1416
 MAX_VALUE = 1e30  # 1/sr; no measurement is larger, and squares stay finite
+MIN_VALUE = 1e-30  # 1/sr; a measurement without a larger one holds nothing that could be computed with
 NUM_EXAMPLES = 3
 
 
@@ -114,7 +115,7 @@ def clean(raw: RawSamples, *, bilateral: bool | Literal["auto"] = "auto", method
         The samples that are left, in file order with their row numbers, and the report.
 
     Raises:
-        UserError: fewer than 4 samples or no positive value are left.
+        UserError: fewer than 4 samples or no positive value above `MIN_VALUE` are left.
     """
     finite = np.abs(raw.value) <= MAX_VALUE
     angles_finite = np.isfinite(raw.theta_i) & np.isfinite(raw.theta_o) & np.isfinite(raw.phi_o)
@@ -138,8 +139,9 @@ def clean(raw: RawSamples, *, bilateral: bool | Literal["auto"] = "auto", method
             f"expected at least {MIN_SAMPLES}; the others are not finite or below the horizon"
         )
     live = kept.value[:, ~dead]
-    if not np.any(live > 0):
-        raise UserError(f"{raw.source}: no positive value in the {kept.num_samples} usable samples")
+    if not np.any(live > MIN_VALUE):
+        found = f"no positive value in the {kept.num_samples} usable samples"
+        raise UserError(f"{raw.source}: {found}" + f", but below {MIN_VALUE:g}" * bool(np.any(live > 0)))
 
     mark(Flag.CLIPPED, where[np.maximum(kept.theta_i, kept.theta_o) > top])
     kept = dataclasses.replace(kept, theta_i=np.minimum(kept.theta_i, top), theta_o=np.minimum(kept.theta_o, top))

@@ -1,8 +1,10 @@
 """HDF5 as this project writes it: units, dimension scales, chunks, no time stamps; and a wary reader of it."""
 
+import contextlib
 import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -10,8 +12,30 @@ import numpy as np
 
 from sbrdf_jax.errors import UserError
 
-CHUNKED_FROM = 2  # dimensions; smaller datasets are contiguous
+CHUNKED_FROM = 2  # dimensions
+GROWTH = 2**22  # bytes; a file in memory grows by so much
+LARGEST_COMPACT = 2**15  # bytes; datasets up to it lie in their own header, whose checksum covers them
+FORMAT = ("v110", "v110")  # of HDF5: the oldest whose every header has a checksum, so that damage is told, not followed
+LONGEST_REASON = 200  # characters of an error that quotes a file
 MOST_EXPANSION = 1000  # a dataset may declare at most this many times what it holds, or the file is refused
+
+
+@contextlib.contextmanager
+def file_in_memory(path: Path) -> Iterator[h5py.File]:
+    """Yield an empty HDF5 file; what is written to it reaches the disk at the end, in one piece.
+
+    On a full disk the HDF5 library fails again at every later call, that of the interpreter's end included; here
+    Python writes the file, and fails once.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    options: dict[str, Any] = {"driver": "core", "backing_store": False, "block_size": GROWTH, "libver": FORMAT}
+    with h5py.File(path, "w", **options) as file:
+        yield file
+        file.flush()
+        image = file.id.get_file_image()
+    path.write_bytes(image)
 
 
 def degrees(angle) -> np.ndarray:
@@ -22,13 +46,21 @@ def degrees(angle) -> np.ndarray:
 
 
 def dataset(group: h5py.Group, name: str, value, units: str, axes: list[h5py.Dataset]) -> h5py.Dataset:
-    """Write one dataset with units and a dimension scale on each axis; chunked by its first axis where it has more."""
+    """Write one dataset with units and a dimension scale on each axis; chunked by its first axis where it has more.
+
+    A checksum covers every one, whatever its size: a flipped bit is an error, never another number.
+    """
     value = np.asarray(value)
     if value.dtype.kind == "f":
         value = value.astype(np.float64)
     options: dict[str, Any] = {"track_times": False}  # equal input, equal bytes
     if value.ndim >= CHUNKED_FROM and value.size:
         options |= {"chunks": (1, *value.shape[1:]), "fletcher32": True}
+    elif value.nbytes <= LARGEST_COMPACT:
+        options["dcpl"] = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        options["dcpl"].set_layout(h5py.h5d.COMPACT)
+    else:
+        options |= {"chunks": True, "fletcher32": True}
     written = group.create_dataset(name, data=value, dtype=value.dtype, **options)
     written.attrs["units"] = units
     for dimension, axis in enumerate(axes):
@@ -119,6 +151,11 @@ def read_mapping(group: h5py.Group) -> dict[str, Any]:
     return found
 
 
+def shortened(text: str) -> str:
+    """Return the first part of a long text: what a damaged file says of itself may have any length."""
+    return text if len(text) <= LONGEST_REASON else text[: LONGEST_REASON - 3] + "..."
+
+
 def one_line_errors(read):
     """Turn whatever a damaged file makes h5py or NumPy raise into one line that names the file."""
 
@@ -126,8 +163,8 @@ def one_line_errors(read):
     def wrapped(path, *args, **kwargs):
         try:
             return read(path, *args, **kwargs)
-        except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError, OverflowError) as error:
-            reason = " ".join(str(error).split())
+        except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, ArithmeticError) as error:
+            reason = shortened(" ".join(str(error).split()))
             raise UserError(f"{path}: the result cannot be read, it is damaged: {reason}") from error
 
     return wrapped

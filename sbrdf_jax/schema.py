@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 
 from sbrdf_jax.errors import UserError
-from sbrdf_jax.hdf5 import attribute
+from sbrdf_jax.hdf5 import attribute, shortened
 
 SCHEMA_NAME = "sbrdf-result"
 SCHEMA_VERSION = 1
@@ -27,7 +27,8 @@ def open_result(path: str | os.PathLike):
     with h5py.File(path, "r") as file:
         found = file.attrs.get("schema_name")
         if found != SCHEMA_NAME:
-            raise UserError(f"{path}: schema_name: found {found!r}, expected {SCHEMA_NAME!r}: this is not a result")
+            shown = shortened(repr(found))
+            raise UserError(f"{path}: schema_name: found {shown}, expected {SCHEMA_NAME!r}: this is not a result")
         version = int(attribute(file, "schema_version"))
         if version > SCHEMA_VERSION:
             raise UserError(

@@ -25,6 +25,7 @@ from sbrdf_jax.hdf5 import (
     dataset,
     dataset_of,
     degrees,
+    file_in_memory,
     group_of,
     one_line_errors,
     read_datasets,
@@ -83,7 +84,7 @@ def save(path: str | os.PathLike, result: RunResult) -> None:
     Raises:
         UserError: the path cannot be written.
     """
-    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+    with whole_file(path) as temporary, file_in_memory(temporary) as file:
         write_result(file, result)
 
 
@@ -183,6 +184,7 @@ def _read_grid(file: h5py.File) -> GriddedBRDF:
     return read_grid(group_of(file, "grid"), group_of(file, "field") if "field" in file else None)
 
 
+@one_line_errors
 def describe(path: str | os.PathLike) -> list[str]:
     """Describe a result in lines for a user: what the file is, then the tables of its summary.
 

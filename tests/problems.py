@@ -51,6 +51,17 @@ def least_squares_problems() -> list[LeastSquaresProblem]:
     ]
 
 
+def singular_problem(condition: float, *, rows: int = 40, unknowns: int = 20, lanes: int = 3) -> LeastSquaresProblem:
+    """A planted problem whose A'A, diagonally scaled, has about a condition number; some unknowns are at their bound.
+
+    The columns are of unit length but for rounding: the singular values decay evenly, and a rotation spreads them.
+    """
+    rng = np.random.default_rng(13)
+    left, right = (np.linalg.qr(rng.standard_normal((n, unknowns)))[0] for n in (rows, unknowns))
+    matrix = left * np.geomspace(1.0, condition**-0.5, unknowns) @ right.T
+    return _planted(f"condition number {condition:.0e}", rng, matrix / np.linalg.norm(matrix, axis=0), lanes, 0.3)
+
+
 def scattered_samples(
     rng: np.random.Generator, theta_i_deg: list[float], num_directions: int, num_wavelengths: int, *, half: bool = False
 ) -> RawSamples:

@@ -118,6 +118,7 @@ def test_a_dead_channel_fails_alone(amber):
         ({"theta_o": (slice(3, None), 2.0)}, "found 3 usable samples"),
         ({"value": (slice(None), -1.0)}, "no positive value"),
         ({"value": (slice(None), np.nan)}, "no positive value"),
+        ({"value": (slice(None), 1e-310)}, "but below 1e-30"),
         ({"value": ((slice(None), 0), np.nan), "theta_i": (slice(None), np.nan)}, "found 0 usable samples"),
     ],
 )

@@ -172,12 +172,9 @@ sys.path[:0] = {[str(Path(__file__).parent.parent), str(Path(__file__).parent)]}
 import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
-from sbrdf_jax import store
+from sbrdf_jax import files, store
 from small_results import UNIFORM_NM, small_grid
-def killed(group, *_):
-    group.file.flush()
-    os.kill(os.getpid(), signal.SIGKILL)
-store.write_metrics = killed
+files._sync = lambda path: os.kill(os.getpid(), signal.SIGKILL)
 store.save({str(path)!r}, store.RunResult(gridded=small_grid(np.random.default_rng(0), wavelength_nm=UNIFORM_NM)))
 """
     for _ in range(2):

@@ -2,13 +2,11 @@
 
 from pathlib import Path
 
-import h5py
-
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.formats.isolated import read_isolated
 from sbrdf_jax.formats.table import MAX_NUMBERS, QUANTITIES, Table
 from sbrdf_jax.formats.text import shorten
-from sbrdf_jax.hdf5 import degrees
+from sbrdf_jax.hdf5 import degrees, file_in_memory
 from sbrdf_jax.records import RawSamples
 
 SCHEMA_NAME = "sbrdf-raw"
@@ -69,7 +67,7 @@ def read_hdf5(path: Path) -> Table:
 
 def write_hdf5(path: Path, samples: RawSamples) -> None:
     """Write samples as the project's raw HDF5."""
-    with h5py.File(path, "w") as file:
+    with file_in_memory(path) as file:
         file.attrs["schema_name"] = SCHEMA_NAME
         file.attrs["schema_version"] = SCHEMA_VERSION
         file.attrs["quantity"] = samples.quantity
