@@ -18,7 +18,7 @@ from sbrdf_jax.errors import UserError
 from sbrdf_jax.files import whole_file
 from sbrdf_jax.formats.isolated import read_isolated
 from sbrdf_jax.grid import Grid
-from sbrdf_jax.hdf5 import dataset, degrees, scale
+from sbrdf_jax.hdf5 import dataset, degrees, file_in_memory, scale
 
 SCHEMA_NAME, SCHEMA_VERSION = "sbrdf-footprint", 1
 MATERIAL_MARK = "#"  # FOOTPRINT.h5#NAME names one of its materials
@@ -44,7 +44,7 @@ def write_footprint(path: str | os.PathLike, axes: tuple[np.ndarray, ...], count
         axes: Centres of the cells: theta_i, theta_o, folded phi_o [rad].
         counts: By material: [theta_i, theta_o, phi_o].
     """
-    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+    with whole_file(path) as temporary, file_in_memory(temporary) as file:
         file.attrs["schema_name"], file.attrs["schema_version"] = SCHEMA_NAME, SCHEMA_VERSION
         file.attrs["materials"] = ",".join(counts)
         scales = [scale(file, name, degrees(axis), "deg") for name, axis in zip(AXES, axes, strict=True)]

@@ -18,7 +18,7 @@ from sbrdf_jax.grid import make_grid, second_difference_rows
 from sbrdf_jax.options import InputOptions, ResampleOptions
 from sbrdf_jax.records import GriddedBRDF, RawSamples, Status
 from sbrdf_jax.resampling import resample
-from sbrdf_jax.resampling.geometry import Geometry
+from sbrdf_jax.resampling.kept import Kept
 from sbrdf_jax.sinc import Window
 from tests.stress.hostile import GRID, NUM_DIRECTIONS, WAVELENGTH_NM, measured, with_values
 
@@ -33,13 +33,13 @@ def check(prove, examples: int, **strategies) -> None:
     limits(hypothesis.given(**strategies)(prove))()
 
 
-GEOMETRY = Geometry()
+KEPT = Kept()
 
 
 def fit(samples: RawSamples, *, weight: float = 1.0, window: Window = "factor") -> GriddedBRDF:
     """The field of method paper on the whole circle: samples of both half-planes."""
     options = ResampleOptions("paper", weight, window, tolerance=1e-8)
-    found = resample(samples, make_grid(samples, GRID, bilateral=False), options, geometry=GEOMETRY)
+    found = resample(samples, make_grid(samples, GRID, bilateral=False), options, kept=KEPT)
     assert (np.asarray(found.status) == Status.OK).all()
     return found
 
