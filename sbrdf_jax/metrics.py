@@ -17,8 +17,8 @@ from sbrdf_jax.angles import angle_between
 from sbrdf_jax.encoding import decode
 from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_on_axes, measured_wavelengths
 from sbrdf_jax.grid import midpoints
-from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralBasis, SpectralField
-from sbrdf_jax.representation import lobe_tensor
+from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, SpectralBasis, SpectralField
+from sbrdf_jax.representation import lobe_harmonics, lobe_tensor
 from sbrdf_jax.representation.paper import compact_coefficient
 from sbrdf_jax.representation.target import PAPER_DIRECTIONS
 
@@ -46,7 +46,7 @@ class Metrics:
 def measure(
     gridded: GriddedBRDF,
     field: SpectralField | None = None,
-    compact: CompactBRDF | LobeTensor | None = None,
+    compact: CompactBRDF | LobeHarmonics | LobeTensor | None = None,
     *,
     absolute: bool = True,
     seed: int = 0,
@@ -109,7 +109,9 @@ def relative_deviation(reconstructed: np.ndarray, original: np.ndarray) -> np.nd
     return np.where(reconstructed == original, 0.0, deviation)
 
 
-def error_at_nodes(compact: CompactBRDF | LobeTensor, gridded: GriddedBRDF, matching: colour.ColourMatching) -> dict:
+def error_at_nodes(
+    compact: CompactBRDF | LobeHarmonics | LobeTensor, gridded: GriddedBRDF, matching: colour.ColourMatching
+) -> dict:
     """Compare compact form and grid at the grid's nodes: eq. (18), median relative error, Delta E 2000 under D65.
 
     All nodes count, copies at the poles and at 360 degrees included, as the paper counts;
@@ -143,7 +145,7 @@ def live_wavelengths(gridded: GriddedBRDF) -> np.ndarray:
     return np.all(np.isfinite(np.asarray(gridded.brdf)), axis=(0, 1, 2))
 
 
-def error_between(compact: CompactBRDF | LobeTensor, gridded: GriddedBRDF) -> dict:
+def error_between(compact: CompactBRDF | LobeHarmonics | LobeTensor, gridded: GriddedBRDF) -> dict:
     """Eq. (18) at cell midpoints of theta_o and phi_o, against the grid stage there; and with theta_i midway too.
 
     Midway between incident angles it is NaN where the grid interpolates nothing over them.
@@ -165,17 +167,17 @@ def error_between(compact: CompactBRDF | LobeTensor, gridded: GriddedBRDF) -> di
     }
 
 
-def error_split(compact: CompactBRDF | LobeTensor, field: SpectralField, gridded: GriddedBRDF) -> dict:
+def error_split(compact: CompactBRDF | LobeHarmonics | LobeTensor, field: SpectralField, gridded: GriddedBRDF) -> dict:
     """Split the error at the nodes into spectral truncation, background and lobe, each as an eta of eq. (18).
 
-    Of a lobe tensor only the first, by the spectra that it stores.
+    Of other methods than the paper's only the first, by the spectra that it stores.
     Spectral: the grid against its own truncated spectra. The rest is the misfit of the
     coefficients, which belongs to the lobe within the lane's critical angle and to the
     background elsewhere, and everywhere in lanes without a lobe. Squares add up to that of
     the whole but for cross terms, which are small because the bases are nearly orthogonal.
     """
     live = live_wavelengths(gridded)
-    if isinstance(compact, LobeTensor):
+    if not isinstance(compact, CompactBRDF):
         return {"error_spectral": truncation_error(compact.basis, np.asarray(gridded.brdf)[..., live])}
     parts = {"error_spectral": [], "error_background": [], "error_lobe": []}
     for i in range(len(gridded.theta_i)):
@@ -213,7 +215,7 @@ def _slice_split(compact, field, original, i):
     return tuple((part**2).sum() for part in (spectral, background, lobe))
 
 
-def stored_numbers(compact: CompactBRDF | LobeTensor) -> int:
+def stored_numbers(compact: CompactBRDF | LobeHarmonics | LobeTensor) -> int:
     """Count all numbers that the `compact` group of a result holds, its axes included.
 
     The matrices of the spectral basis are not stored but for the vectors of "data": they follow
@@ -221,6 +223,8 @@ def stored_numbers(compact: CompactBRDF | LobeTensor) -> int:
     """
     if isinstance(compact, LobeTensor):
         return lobe_tensor.stored_numbers(compact)
+    if isinstance(compact, LobeHarmonics):
+        return lobe_harmonics.stored_numbers(compact)
     fields = ("theta_i", "background", "lobe_kind", "lobe_height", "lobe_width", "critical_angle", "lobe_peak_theta_o")
     held = sum(np.size(getattr(compact, name)) for name in (*fields, "status"))
     num_coefficients, num_harmonics = np.shape(compact.background)[1:]
@@ -228,7 +232,7 @@ def stored_numbers(compact: CompactBRDF | LobeTensor) -> int:
     return held + np.size(compact.basis.wavelength_nm) + num_coefficients + num_harmonics + vectors
 
 
-def compression(compact: CompactBRDF | LobeTensor) -> dict:
+def compression(compact: CompactBRDF | LobeHarmonics | LobeTensor) -> dict:
     """Numbers of the grid at the paper's 13 x 49 x wavelengths an incident angle over the numbers of the compact form.
 
     Only 13 x 49 - 60 of those directions are distinct, and half of them are mirror images.
@@ -237,7 +241,7 @@ def compression(compact: CompactBRDF | LobeTensor) -> dict:
     """
     grid = PAPER_DIRECTIONS * np.size(compact.basis.wavelength_nm)
     everything = {"compression_ratio": np.size(compact.theta_i) * grid / stored_numbers(compact)}
-    if isinstance(compact, LobeTensor):
+    if not isinstance(compact, CompactBRDF):
         return everything
     _, num_coefficients, num_harmonics = np.shape(compact.background)
     return everything | {"compression_ratio_paper": grid / ((num_harmonics + 2) * num_coefficients)}
