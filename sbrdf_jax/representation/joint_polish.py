@@ -32,6 +32,8 @@ def polish_lobes(
     lobes: Lobes,
     degree: Int[np.ndarray, "lane channel"],
     limits: Float[np.ndarray, "shape 2"],
+    *,
+    num_steps: int = NUM_STEPS,
 ) -> Lobes:
     """Refine lobes; a lane never ends worse than it starts.
 
@@ -41,6 +43,7 @@ def polish_lobes(
         lobes: Where to start, [lane, lobe].
         degree: Of each channel's background; a channel of degree -1 takes no part.
         limits: Least and greatest width of each shape.
+        num_steps: For all lanes; there is no other end.
 
     Numerics:
         At normal incidence the peak is the normal. A lane that is not finite stays where it is.
@@ -59,7 +62,7 @@ def polish_lobes(
 
     error, slope, curvature = evaluate(best)
     damping = np.full(len(i), FIRST_DAMPING)
-    for _ in range(NUM_STEPS):
+    for _ in range(num_steps):
         free = ((best > lower) | (slope > 0)) & ((best < upper) | (slope < 0)) & (upper > lower)
         diagonal = np.einsum("luu->lu", curvature)
         usable = free & (diagonal > 0)
@@ -96,8 +99,9 @@ def projected_step(
     of_lobe = np.arange(columns.shape[2]) % NUM_LOBES
     gram, moment = inner.gram, inner.moment  # [lane, channel, column, column], [lane, channel, column]
     own = gram[..., lobes, lobes]
-    whole = np.maximum(np.einsum("ldk,ldk->lk", columns[..., lobes], columns[..., lobes]), 1e-300)
-    ridge = own + DEPENDENT**2 * np.einsum("lk,km->lkm", whole, np.eye(NUM_LOBES))[:, None]
+    whole = np.einsum("ldk,ldk->lk", columns[..., lobes], columns[..., lobes])
+    hold = np.where(whole > 0, DEPENDENT**2 * whole, 1.0)  # a lobe that is absent gets height 0
+    ridge = own + np.einsum("lk,km->lkm", hold, np.eye(NUM_LOBES))[:, None]
     solved = np.linalg.solve(ridge, np.concatenate([moment[..., lobes, None], gram[..., lobes, NUM_LOBES:]], axis=-1))
     height, along = solved[..., 0], solved[..., 1:]
     used = (degree >= 0)[..., None]

@@ -174,17 +174,25 @@ class _AngleFits:
         few = problem._replace(value=problem.value[..., :SEARCH_CHANNELS])
         degrees = tuple(degree for degree in SEARCH_DEGREES if degree <= max_degree) or (max_degree,)
         peak = mirror_peaks(nodes.brdf[counts].mean(axis=-1), nodes.theta_i[counts], nodes.theta_o)
-        in_bank = search_bank(few, peak, self.limits, degrees).lobes
-        choices, num_degrees, num_i, _ = in_bank.kind.shape
-        flat = Lobes(*(part.reshape(-1, NUM_LOBES) for part in in_bank))
-        i = np.tile(np.arange(num_i), choices * num_degrees)
-        degree = np.repeat(np.tile(degrees, choices), num_i)
-        degree = np.broadcast_to(degree[:, None], (len(i), few.value.shape[2]))
-        refined = polish_lobes(few, i, flat, degree, self.limits)
-        none = Lobes(np.zeros((1, num_i, NUM_LOBES), int), *np.ones((2, 1, num_i, NUM_LOBES)))
-        return Lobes(
-            *(np.concatenate([a, b.reshape(-1, num_i, NUM_LOBES)]) for a, b in zip(none, refined, strict=True))
-        )
+        in_bank = search_bank(few, peak, self.limits, degrees).lobes  # [choice, degree, i, lobe]
+        refined = Lobes(*(np.concatenate(list(part)) for part in in_bank))
+        degree = np.tile(degrees, len(in_bank.kind))
+        refined = self._polish(few, refined, degree)
+        # a neighbour's lobes, moved with the mirror direction: where an incident angle went astray, and for even tracks
+        pairs = [Lobes(*(part[k] for part in refined)) for k in range(len(degrees))]
+        beside = [_of_neighbour(pair, nodes.theta_i[counts], step) for pair in pairs for step in (-1, 1)]
+        beside = Lobes(*(np.stack(parts) for parts in zip(*beside, strict=True)))
+        beside = self._polish(few, beside, np.repeat(degrees, 2))
+        none = Lobes(np.zeros((1, *refined.kind.shape[1:]), int), *np.ones((2, 1, *refined.kind.shape[1:])))
+        return Lobes(*(np.concatenate(parts) for parts in zip(none, refined, beside, strict=True)))
+
+    def _polish(self, problem: AngleProblem, lobes: Lobes, degree: np.ndarray) -> Lobes:
+        """Refine sets of lobes [set, i, lobe], each with its degree of the background."""
+        sets, num_i, _ = lobes.kind.shape
+        flat = Lobes(*(part.reshape(-1, NUM_LOBES) for part in lobes))
+        of_lane = np.broadcast_to(np.repeat(degree, num_i)[:, None], (sets * num_i, problem.value.shape[2]))
+        refined = polish_lobes(problem, np.tile(np.arange(num_i), sets), flat, of_lane, self.limits)
+        return Lobes(*(part.reshape(sets, num_i, NUM_LOBES) for part in refined))
 
     def _measure(self):
         """Find what every set of lobes leaves and costs by degree; errors relative to the incident angle's energy."""
@@ -194,7 +202,7 @@ class _AngleFits:
         lane_i = np.tile(np.arange(num_i), sets)
         shapes = shapes_of(problem, lane_i, flat)
         self.shapes = shapes.reshape(sets, num_i, *shapes.shape[1:])
-        inner = [inner_products(problem, i, shape) for i, shape in zip(lane_i, shapes, strict=True)]
+        inner = [inner_products(problem, i, shape) for i, shape in zip(lane_i.tolist(), shapes, strict=True)]
         stacked = type(inner[0])(*(np.stack(parts) for parts in zip(*inner, strict=True)))
         error = heights_and_errors(stacked)[1].reshape(sets, num_i, -1, self.num_channels)
         error[:, :, 0] = stacked.energy[:, 0].reshape(sets, num_i, -1)  # degree -1: not even heights
@@ -272,7 +280,7 @@ class _AngleFits:
         refined = polish_lobes(self.problem, i, lobes, degree, self.limits)
         shapes = self.shapes[[choice.lobes for choice in chosen], i], shapes_of(self.problem, i, refined)
         heights, backgrounds, reached = [], [], []
-        for k in i:
+        for k in range(len(chosen)):
             trials = []
             for number, shape in enumerate(shapes):
                 solved = self._solve(k, shape[k], degree[k])
@@ -290,7 +298,16 @@ class _AngleFits:
             return solution, max(reached)
         fixed = _fixed_numbers(self.num_theta_i, solution.degree, self.num_wavelengths, self.stores_vectors)
         stored = fixed + sum(choice.numbers for choice in chosen)
-        return solution, measured(self.target, stored, self.brdf, self.brdf, self.twins, np.ones(1, bool), None)
+        known = np.ones(len(self.brdf), bool)
+        return solution, measured(self.target, stored, self.brdf, self.brdf, self.twins, known, None)
+
+
+def _of_neighbour(lobes: Lobes, theta_i: np.ndarray, step: int) -> Lobes:
+    """Return at each incident angle the lobes of the one before or behind, moved with the mirror direction."""
+    place = np.clip(np.arange(len(theta_i)) + step, 0, len(theta_i) - 1)
+    off_mirror = (lobes.peak_theta_o - theta_i[:, None])[place]
+    peak = np.where(theta_i[:, None] < SAME_ANGLE, 0.0, theta_i[:, None] + off_mirror)
+    return Lobes(lobes.kind[place], lobes.width[place], peak)
 
 
 def mirror_peaks(value: Float[np.ndarray, "i o p"], theta_i: np.ndarray, theta_o: np.ndarray) -> np.ndarray:

@@ -24,7 +24,9 @@ def even_orders(max_degree: int) -> list[tuple[int, int]]:
     return [(l, m) for l, m in harmonic_orders(max_degree) if m >= 0]  # noqa: E741
 
 
-def even_harmonics(theta: Float[Array, "*shape"], phi: Float[Array, "*shape"], max_degree: int):
+def even_harmonics(
+    theta: Float[Array | np.ndarray, "*shape"], phi: Float[Array | np.ndarray, "*shape"], max_degree: int
+) -> Float[Array, "*shape harmonic"]:
     """Return the harmonics of `even_orders` [..., harmonic]."""
     places = np.flatnonzero([m >= 0 for _, m in harmonic_orders(max_degree)])
     return real_harmonics(theta, phi, max_degree)[..., places]
