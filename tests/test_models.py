@@ -55,6 +55,11 @@ def planted_samples(name, directions, scale=1.0):
     return Samples(*directions, value, equal_weights(directions[0], value)), amplitude
 
 
+def each(name, samples):
+    """The fit of each wavelength, of one model with a parameter: it compiles for seconds."""
+    return [fit_each_wavelength(MODELS[name], samples)] if name == "ward" else []
+
+
 @pytest.mark.parametrize("name", HAND)
 def test_hand_values_in_the_mirror_direction(name):
     angle = jnp.asarray(np.radians(60.0))
@@ -105,7 +110,7 @@ def test_never_nan_nor_negative_at_the_poles_and_at_grazing(name):
 @pytest.mark.parametrize("name", MODELS)
 def test_planted_parameters_come_back(name, scattered):
     samples, amplitude = planted_samples(name, scattered)
-    for fit in (fit_each_wavelength(MODELS[name], samples), fit_jointly(MODELS[name], samples)):
+    for fit in (fit_jointly(MODELS[name], samples), *each(name, samples)):
         np.testing.assert_array_equal(fit.status, Status.OK)
         assert fit.relative_error.max() < 1e-4
         np.testing.assert_allclose(predict(MODELS[name], fit, *scattered), samples.value, rtol=0, atol=1e-3)
