@@ -26,6 +26,7 @@ LANES_AT_A_TIME = 8
 JOINT_WAVELENGTHS = 9  # evenly chosen ones decide the parameters that all share
 TINY = 1e-300
 DEPENDENT = 1e-12  # terms whose angle squared is below it are one
+AT_EDGE = 1e-3  # of a parameter's range
 EDGE = 1e-6  # of a parameter's range, where starts and answers end
 
 
@@ -169,6 +170,9 @@ def _fit_lane(model: Model, c, root_weight, value, start) -> Lane:
         unknown = jnp.where(after <= before, solution.value, first)
         at, left = parameters(unknown), residual(unknown, None)
         jacobian = jax.jacfwd(residual)(unknown, None).reshape(-1, len(unknown))
+        place = jax.nn.sigmoid(unknown)
+        is_inside = (place > AT_EDGE) & (place < 1 - AT_EDGE)  # at an edge a parameter has no say
+        jacobian = jnp.where(is_inside[None], jacobian, 0.0)
         gram = jacobian.T @ jacobian
         ridge = jnp.finfo(gram.dtype).eps * (jnp.trace(gram) + 1) * jnp.eye(len(unknown))
         slope = jacobian.T @ left.ravel()

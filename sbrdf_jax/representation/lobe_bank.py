@@ -5,13 +5,13 @@ the best of all local optima; the steps that follow are few, the same number for
 that no lane waits for another. A lane never ends worse than its best width of the bank.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-NEWTON_STEPS = 5
+NEWTON_STEPS = 3
 SMALLEST = 1e-300
 
 
@@ -56,36 +56,39 @@ def _fit_group(target, weight, exponent, widths):
     last = widths.shape[0] - 1
     low, high = bank[jnp.maximum(best - 1, 0)], bank[jnp.minimum(best + 1, last)]
     log_width = bank[best]
-    gain, slope, bend = _gain(log_width, moment, weight, exponent)
+    first = _gain(log_width, moment, weight, exponent)
 
     def step(state, _):
-        log_width, gain, move, slope, bend = state
+        log_width, at, move = state
         trial = jnp.clip(log_width + move, low, high)
-        new_gain, new_slope, new_bend = _gain(trial, moment, weight, exponent)
-        better = new_gain > gain
-        log_width, gain = jnp.where(better, trial, log_width), jnp.where(better, new_gain, gain)
-        slope, bend = jnp.where(better, new_slope, slope), jnp.where(better, new_bend, bend)
-        move = jnp.where(better, _newton(slope, bend, high - low), move / 2)
-        return (log_width, gain, move, slope, bend), None
+        found = _gain(trial, moment, weight, exponent)
+        better = found.gain > at.gain
+        at = jax.tree.map(lambda new, old: jnp.where(better, new, old), found, at)
+        log_width = jnp.where(better, trial, log_width)
+        return (log_width, at, jnp.where(better, _newton(at, high - low), move / 2)), None
 
-    start = (log_width, gain, _newton(slope, bend, high - low), slope, bend)
-    (log_width, gain, *_), _ = jax.lax.scan(step, start, None, length=NEWTON_STEPS)
-    width = jnp.exp(log_width)
-    shape = jnp.exp(-exponent[None] / width[:, None])
-    energy = jnp.sum(weight * shape**2, axis=1)
-    height = jnp.sum(moment * shape, axis=1) / jnp.where(energy > 0, energy, 1.0)
-    error = jnp.sum(weight * (target - height[:, None] * shape) ** 2, axis=1)
-    return BankLobes(height, width, error)
+    start = (log_width, first, _newton(first, high - low))
+    (log_width, at, _), _ = jax.lax.scan(step, start, None, length=NEWTON_STEPS)
+    return BankLobes(at.height, jnp.exp(log_width), jnp.maximum(jnp.sum(moment * target, axis=1) - at.gain, 0.0))
 
 
-def _newton(slope, bend, span):
+class _Gain(NamedTuple):
+    """What a lobe of one width takes off a lane's error, its height, and two derivatives of log gain by log width."""
+
+    gain: Any
+    height: Any
+    slope: Any
+    bend: Any
+
+
+def _newton(at, span):
     """Return the step to the maximum of a parabola, or uphill where it opens upwards."""
-    is_peak = bend < 0
-    return jnp.where(is_peak, -slope / jnp.where(is_peak, bend, 1.0), jnp.sign(slope) * span / 4)
+    is_peak = at.bend < 0
+    return jnp.where(is_peak, -at.slope / jnp.where(is_peak, at.bend, 1.0), jnp.sign(at.slope) * span / 4)
 
 
-def _gain(log_width, moment, weight, exponent):
-    """Return A^2 / G, and two derivatives of its logarithm by that of the width."""
+def _gain(log_width, moment, weight, exponent) -> _Gain:
+    """Return A^2 / G and its like, by one pass over the directions."""
     scaled = exponent[None] * jnp.exp(-log_width)[:, None]
     shape = jnp.exp(-scaled)
     first = moment * shape
@@ -96,4 +99,4 @@ def _gain(log_width, moment, weight, exponent):
     slope = 2 * a_1 / safe_a - 2 * g_1 / safe_g
     bend = 2 * ((a_2 - a_1) / safe_a - (a_1 / safe_a) ** 2)
     bend -= (4 * g_2 - 2 * g_1) / safe_g - (2 * g_1 / safe_g) ** 2
-    return a * a / safe_g, slope, bend
+    return _Gain(a * a / safe_g, a / safe_g, slope, bend)
