@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-NEWTON_STEPS = 3
+STEPS = 4  # the first to the vertex of a parabola through the bank's best, then Newton's
 SMALLEST = 1e-300
+ROUNDING = 8  # machine epsilons of a gain by which a step may lose
 
 
 class BankLobes(NamedTuple):
@@ -21,6 +22,7 @@ class BankLobes(NamedTuple):
     height: Float[Array, "group lane"]
     width: Float[Array, "group lane"]
     error: Float[Array, "group lane"]  # weighted sum of squares that the lobe leaves
+    promised: Float[Array, "group lane"]  # what one more step would take off it
 
 
 @jax.jit
@@ -41,7 +43,7 @@ def fit_lobe_bank(
     Numerics:
         With A = sum of weight * target * shape and G = sum of weight * shape^2, the error falls by
         A^2 / G, whose logarithm is maximised over the logarithm of the width by Newton's method
-        between the neighbours of the bank's best; a step that does not gain is halved. A lane of
+        between the neighbours of the bank's best; a step that loses is halved. A lane of
         zeros, or without weight, has height 0; one that is not finite stays so and harms no other.
     """
     return jax.lax.map(lambda group: _fit_group(*group), (target, weight, exponent, widths))
@@ -51,25 +53,34 @@ def _fit_group(target, weight, exponent, widths):
     shapes = jnp.exp(-exponent[None] / widths[:, None])
     moment = weight * target
     along, energy = moment @ shapes.T, weight @ (shapes**2).T
-    best = jnp.argmax(along**2 / jnp.maximum(energy, SMALLEST), axis=1)
-    bank = jnp.log(widths)
+    gain = along**2 / jnp.maximum(energy, SMALLEST)
     last = widths.shape[0] - 1
-    low, high = bank[jnp.maximum(best - 1, 0)], bank[jnp.minimum(best + 1, last)]
-    log_width = bank[best]
-    first = _gain(log_width, moment, weight, exponent)
+    best = jnp.argmax(gain, axis=1)
+    three = jnp.clip(jnp.stack([best - 1, best, best + 1], axis=1), 0, last)
+    bank = jnp.log(widths)
+    low, log_width, high = bank[three].T
+    below, top, above = jnp.take_along_axis(gain, three, axis=1).T
+    bend = below - 2 * top + above  # a parabola through the three, where there are three
+    is_inside = (best > 0) & (best < last) & (bend < 0)
+    move = jnp.where(is_inside, (below - above) / jnp.where(is_inside, bend, 1.0) * (high - low) / 4, 0.0)
+    move = jnp.where(best == 0, (high - low) / 2, jnp.where(best == last, (low - high) / 2, move))
 
     def step(state, _):
         log_width, at, move = state
         trial = jnp.clip(log_width + move, low, high)
         found = _gain(trial, moment, weight, exponent)
-        better = found.gain > at.gain
+        better = found.gain >= at.gain * (1 - ROUNDING * jnp.finfo(found.gain.dtype).eps)  # flat at the top
         at = jax.tree.map(lambda new, old: jnp.where(better, new, old), found, at)
         log_width = jnp.where(better, trial, log_width)
         return (log_width, at, jnp.where(better, _newton(at, high - low), move / 2)), None
 
-    start = (log_width, first, _newton(first, high - low))
-    (log_width, at, _), _ = jax.lax.scan(step, start, None, length=NEWTON_STEPS)
-    return BankLobes(at.height, jnp.exp(log_width), jnp.maximum(jnp.sum(moment * target, axis=1) - at.gain, 0.0))
+    height = jnp.take_along_axis(along / jnp.maximum(energy, SMALLEST), best[:, None], axis=1)[:, 0]
+    start = _Gain(top, height, jnp.full_like(top, jnp.inf), -jnp.ones_like(top))  # a slope that no step has shown
+    (log_width, at, _), _ = jax.lax.scan(step, (log_width, start, move), None, length=STEPS)
+    error = jnp.maximum(jnp.sum(moment * target, axis=1) - at.gain, 0.0)
+    outward = ((log_width <= bank[0]) & (at.slope <= 0)) | ((log_width >= bank[-1]) & (at.slope >= 0))
+    promised = at.gain * at.slope**2 / jnp.maximum(2 * jnp.abs(at.bend), SMALLEST)
+    return BankLobes(at.height, jnp.exp(log_width), error, jnp.where(outward, 0.0, promised))
 
 
 class _Gain(NamedTuple):
