@@ -139,8 +139,9 @@ def measure(name: str, *, with_paper: bool) -> dict[str, list[tuple[float, float
     print(f"\n{Path(name).name}: {known.sum()} of {per_angle} incident angles have data")
     print(f"{'method':<20} {'numbers':>8} {'bytes':>8} {'median %':>9} {'worst %':>9}")
     targets = [TargetOptions(numbers=size) for size in SIZES] + [TargetOptions(error=error) for error in ERRORS]
-    for target in targets:
-        options = RepresentOptions(method="lobe_tensor", target=target)
+    harmonics = [TargetOptions(numbers=size) for size in (*SIZES[1:-1], 320, SIZES[-1])] + targets[-len(ERRORS) :]
+    for method, target in [("lobe_tensor", t) for t in targets] + [("lobe_harmonics", t) for t in harmonics]:
+        options = RepresentOptions(method=method, target=target)
         represent(field, options, gridded)
         start = time.perf_counter()
         compact = represent(field, options, gridded)
@@ -157,7 +158,7 @@ def measure(name: str, *, with_paper: bool) -> dict[str, list[tuple[float, float
         colour = np.median(at_nodes["delta_e_median"][known])
         share = off_node_scores(compact)[0]
         more = f"{asked}between {off[0]:.2f}, between theta_i {off[1]:.2f}, Delta E {colour:.2f}, < 0: {share:g}"
-        report("lobe_tensor", stored_numbers(compact), at_nodes["relative_error"], f"{more}, {seconds:.2f} s warm")
+        report(method, stored_numbers(compact), at_nodes["relative_error"], f"{more}, {seconds:.2f} s warm")
     for method, baseline in BASELINES.items():
         for size in SIZES:
             numbers, found = baseline(brdf, known, size * per_angle)

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from sbrdf_jax.pipeline import process as process
     from sbrdf_jax.records import CompactBRDF as CompactBRDF
     from sbrdf_jax.records import GriddedBRDF as GriddedBRDF
+    from sbrdf_jax.records import LobeHarmonics as LobeHarmonics
     from sbrdf_jax.records import LobeTensor as LobeTensor
     from sbrdf_jax.records import RawSamples as RawSamples
     from sbrdf_jax.records import SpectralField as SpectralField
@@ -51,7 +52,7 @@ _HOME = {
     "lobes": ("lobe_value",),
     "nnls": ("solve_nnls",),
     "pipeline": ("prepare", "process"),
-    "records": ("CompactBRDF", "GriddedBRDF", "LobeTensor", "RawSamples", "SpectralField", "Status"),
+    "records": ("CompactBRDF", "GriddedBRDF", "LobeHarmonics", "LobeTensor", "RawSamples", "SpectralField", "Status"),
     "representation": ("represent",),
     "resampling": ("resample",),
     "store": ("RunResult", "load", "save"),

@@ -11,7 +11,11 @@ from sbrdf_jax.harmonics import harmonic_orders
 from sbrdf_jax.hdf5 import attribute, dataset, dataset_of, degrees, read, scale
 from sbrdf_jax.lobes import LOBE_KINDS
 from sbrdf_jax.metrics import stored_numbers
-from sbrdf_jax.records import STATUS_TEXT, CompactBRDF, LobeTensor, SpectralBasis, Status
+from sbrdf_jax.records import STATUS_TEXT, CompactBRDF, LobeHarmonics, LobeTensor, SpectralBasis, Status
+from sbrdf_jax.representation.joint_fit import NUM_LOBES
+from sbrdf_jax.representation.lobe_family import SHAPES
+from sbrdf_jax.representation.lobe_harmonics import stored_harmonics
+from sbrdf_jax.representation.lobe_harmonics_value import even_orders
 
 _FACTORS = {  # dataset: its axes
     "log_scale": ("theta_i_function",),
@@ -22,7 +26,7 @@ _FACTORS = {  # dataset: its axes
 }
 
 
-def write_compact(group: h5py.Group, compact: CompactBRDF | LobeTensor) -> None:
+def write_compact(group: h5py.Group, compact: CompactBRDF | LobeHarmonics | LobeTensor) -> None:
     """Write all that evaluation of the compact stage needs, and how each lane ended."""
     group.attrs["stored_numbers"] = stored_numbers(compact)
     group.attrs["basis"] = compact.basis.kind
@@ -31,14 +35,16 @@ def write_compact(group: h5py.Group, compact: CompactBRDF | LobeTensor) -> None:
     scale(group, "wavelength_nm", compact.basis.wavelength_nm, "nm")
     if isinstance(compact, LobeTensor):
         _write_tensor(group, compact)
+    elif isinstance(compact, LobeHarmonics):
+        _write_harmonics(group, compact)
     else:
         _write_paper(group, compact)
 
 
-def read_compact(group: h5py.Group) -> CompactBRDF | LobeTensor:
+def read_compact(group: h5py.Group) -> CompactBRDF | LobeHarmonics | LobeTensor:
     """Read the compact form from its group alone."""
     method = str(attribute(group, "method"))
-    readers = {"paper": _read_paper, "lobe_tensor": _read_tensor}
+    readers = {"paper": _read_paper, "lobe_harmonics": _read_harmonics, "lobe_tensor": _read_tensor}
     if method not in readers:
         found = f"found {method!r}, expected one of {', '.join(readers)}"
         raise UserError(f"{group.file.filename}: compact: method: {found}")
@@ -75,6 +81,55 @@ def _read_tensor(group: h5py.Group) -> LobeTensor:
         interpolate_theta_i=bool(attribute(group, "interpolate_theta_i")),
         **factors,
     )
+
+
+def _write_harmonics(group: h5py.Group, compact: LobeHarmonics) -> None:
+    """Write lobes and backgrounds; heights and harmonics one after another, those that are 0 left out."""
+    group.attrs["method"] = "lobe_harmonics"
+    group.attrs["max_degree"] = compact.max_degree
+    coefficient = write_basis(group, compact.basis, dataset_of(group, "wavelength_nm"))
+    fitted = scale(group, "fitted_theta_i_deg", degrees(compact.fitted_theta_i), "deg")
+    lobe = [fitted, scale(group, "lobe", np.arange(NUM_LOBES), "1")]
+    degree = dataset(group, "degree", np.asarray(compact.degree, np.int64), "1", [fitted, coefficient])
+    degree.attrs["meaning"] = "of the background of a coefficient; -1: the coefficient is 0, lobes included"
+    kind = dataset(group, "lobe_kind", np.asarray(compact.lobe_kind, np.int64), "1", lobe)
+    kind.attrs["names"] = ",".join(SHAPES)
+    width = dataset(group, "lobe_width", compact.lobe_width, "1", lobe)
+    width.attrs["meaning"] = "rad^2 for angle_squared, else without unit"
+    dataset(group, "lobe_peak_theta_o_deg", degrees(compact.lobe_peak_theta_o), "deg", lobe)
+    has_harmonic, has_height = stored_harmonics(compact)
+    background = dataset(group, "background", np.asarray(compact.background)[has_harmonic], "1/sr", [])
+    background.attrs["harmonic_order"] = np.array(even_orders(compact.max_degree))  # rows of (l, m)
+    background.attrs["meaning"] = "by theta_i, coefficient, harmonic up to its degree; at theta_i = 0 those of m = 0"
+    height = dataset(group, "lobe_height", np.asarray(compact.lobe_height)[has_height], "1/sr", [])
+    height.attrs["meaning"] = "by theta_i, lobe that is not none, coefficient that is not 0"
+    status_dataset(group, compact.status, [dataset_of(group, "theta_i_deg")])
+
+
+def _read_harmonics(group: h5py.Group) -> LobeHarmonics:
+    """Read lobes and backgrounds."""
+    theta_i, wavelength_nm = read(group, "theta_i_deg"), read(group, "wavelength_nm")
+    fitted, count = read(group, "fitted_theta_i_deg"), len(read(group, "coefficient"))
+    max_degree = int(attribute(group, "max_degree"))
+    lobes = (len(fitted), NUM_LOBES)
+    compact = LobeHarmonics(
+        theta_i=np.deg2rad(theta_i),
+        fitted_theta_i=np.deg2rad(fitted),
+        basis=read_basis(group, attribute(group, "basis"), wavelength_nm, count),
+        degree=read(group, "degree", (len(fitted), count)),
+        background=np.zeros((len(fitted), count, len(even_orders(max_degree)))),
+        lobe_kind=read(group, "lobe_kind", lobes),
+        lobe_width=read(group, "lobe_width", lobes),
+        lobe_peak_theta_o=np.deg2rad(read(group, "lobe_peak_theta_o_deg", lobes)),
+        lobe_height=np.zeros((*lobes, count)),
+        status=read(group, "status", (len(theta_i),)),
+        max_degree=max_degree,
+        interpolate_theta_i=bool(attribute(group, "interpolate_theta_i")),
+    )
+    has_harmonic, has_height = stored_harmonics(compact)
+    compact.background[has_harmonic] = read(group, "background", (int(has_harmonic.sum()),))
+    compact.lobe_height[has_height] = read(group, "lobe_height", (int(has_height.sum()),))
+    return compact
 
 
 def _write_paper(group: h5py.Group, compact: CompactBRDF) -> None:

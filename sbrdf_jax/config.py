@@ -22,7 +22,6 @@ NOT_YET: dict[str, tuple[Callable[[Any], bool], str]] = {
         lambda value: value in ("rgl-bsdf", "merl", "astm", "pab", "inplane", "alta"),
         "auto, pbrt, csv, hdf5, nist",
     ),
-    "represent.method": (lambda value: value == "lobe_harmonics", "auto, paper, lobe_tensor"),
     "runtime.precision": (lambda value: value == "float32", "float64"),
 }
 

@@ -17,7 +17,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Real
 
 from sbrdf_jax.encoding import decode
 from sbrdf_jax.interpolation import spectral_weights
-from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralField
+from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, SpectralField
+from sbrdf_jax.representation.lobe_harmonics_value import lobe_harmonics_value, pad_coefficients
 from sbrdf_jax.representation.paper import compact_coefficient
 from sbrdf_jax.representation.tensor_value import pad_ranks, tensor_value
 from sbrdf_jax.resampling.guided.field import (
@@ -47,7 +48,8 @@ def evaluate(
     the compact form, which is linear between neighbouring incident angles.
 
     Args:
-        result: GriddedBRDF, SpectralField, CompactBRDF, LobeTensor, or a record with a registered kernel.
+        result: GriddedBRDF, SpectralField, CompactBRDF, LobeHarmonics, LobeTensor, or a record with a
+            registered kernel.
         theta_i: Polar angle of incidence [rad], 0 to pi/2; the three angles broadcast.
         theta_o: Polar angle of exitance [rad], 0 to pi/2.
         phi_o: Azimuth of exitance [rad], any; the mirror direction is at pi.
@@ -134,6 +136,11 @@ def _(result: CompactBRDF, theta_i, theta_o, phi_o, *, wavelength_nm=None):
 @direction_kernel.register
 def _(result: LobeTensor, theta_i, theta_o, phi_o, *, wavelength_nm=None):
     return tensor_value(result, theta_i, theta_o, phi_o, wavelength_nm)
+
+
+@direction_kernel.register
+def _(result: LobeHarmonics, theta_i, theta_o, phi_o, *, wavelength_nm=None):
+    return lobe_harmonics_value(result, theta_i, theta_o, phi_o, wavelength_nm)
 
 
 def measured_wavelengths(result) -> Float[Array | np.ndarray, " wavelength"]:
@@ -243,6 +250,8 @@ def evaluate_in_chunks(
     value = np.empty((count, num_wavelengths))
     if isinstance(result, LobeTensor):
         result = pad_ranks(result)
+    if isinstance(result, LobeHarmonics):
+        result = pad_coefficients(result)
     result = jax.tree.map(jnp.asarray, result)  # to the device once, not with every chunk
     for start in range(0, count, size):
         part = [a[start : start + size] for a in flat]

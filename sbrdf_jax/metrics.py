@@ -18,8 +18,8 @@ from sbrdf_jax.encoding import decode
 from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_on_axes, measured_wavelengths
 from sbrdf_jax.grid import midpoints
 from sbrdf_jax.needs import restrict_theta_i
-from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralBasis, SpectralField
-from sbrdf_jax.representation import lobe_tensor
+from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, SpectralBasis, SpectralField
+from sbrdf_jax.representation import lobe_harmonics, lobe_tensor
 from sbrdf_jax.representation.half_field import cells_between
 from sbrdf_jax.representation.paper import compact_coefficient
 from sbrdf_jax.representation.target import PAPER_DIRECTIONS
@@ -48,7 +48,7 @@ class Metrics:
 def measure(
     gridded: GriddedBRDF,
     field: SpectralField | None = None,
-    compact: CompactBRDF | LobeTensor | None = None,
+    compact: CompactBRDF | LobeHarmonics | LobeTensor | None = None,
     *,
     absolute: bool = True,
     matching: colour.ColourMatching | None = None,
@@ -128,7 +128,9 @@ def relative_deviation(reconstructed: np.ndarray, original: np.ndarray) -> np.nd
     return np.where(reconstructed == original, 0.0, deviation)
 
 
-def error_at_nodes(compact: CompactBRDF | LobeTensor, gridded: GriddedBRDF, matching: colour.ColourMatching) -> dict:
+def error_at_nodes(
+    compact: CompactBRDF | LobeHarmonics | LobeTensor, gridded: GriddedBRDF, matching: colour.ColourMatching
+) -> dict:
     """Compare compact form and grid at the grid's nodes: eq. (18), median relative error, Delta E 2000.
 
     All nodes that are needed count, copies at the poles and at 360 degrees included, as the paper
@@ -190,7 +192,7 @@ def whole_hemispheres(gridded: GriddedBRDF) -> Bool[np.ndarray, " theta_i"]:
     return needed_nodes(gridded).all(axis=(1, 2))
 
 
-def error_between(compact: CompactBRDF | LobeTensor, gridded: GriddedBRDF) -> dict:
+def error_between(compact: CompactBRDF | LobeHarmonics | LobeTensor, gridded: GriddedBRDF) -> dict:
     """Eq. (18) at cell midpoints of theta_o and phi_o, against the grid stage there; and with theta_i midway too.
 
     Midpoints count whose neighbours are all needed; it is nan where there are none, and midway between
@@ -221,17 +223,17 @@ def error_between(compact: CompactBRDF | LobeTensor, gridded: GriddedBRDF) -> di
     }
 
 
-def error_split(compact: CompactBRDF | LobeTensor, field: SpectralField, gridded: GriddedBRDF) -> dict:
+def error_split(compact: CompactBRDF | LobeHarmonics | LobeTensor, field: SpectralField, gridded: GriddedBRDF) -> dict:
     """Split the error at the nodes into spectral truncation, background and lobe, each as an eta of eq. (18).
 
-    Of a lobe tensor only the first, by the spectra that it stores.
+    Of other methods than the paper's only the first, by the spectra that it stores.
     Spectral: the grid against its own truncated spectra. The rest is the misfit of the
     coefficients, which belongs to the lobe within the lane's critical angle and to the
     background elsewhere, and everywhere in lanes without a lobe. Squares add up to that of
     the whole but for cross terms, which are small because the bases are nearly orthogonal.
     """
     live = live_wavelengths(gridded)
-    if isinstance(compact, LobeTensor):
+    if not isinstance(compact, CompactBRDF):
         brdf = np.where(needed_nodes(gridded)[..., None], np.asarray(gridded.brdf), 0.0)
         return {"error_spectral": truncation_error(compact.basis, brdf[..., live])}
     parts = {"error_spectral": [], "error_background": [], "error_lobe": []}
@@ -270,7 +272,7 @@ def _slice_split(compact, field, original, i):
     return tuple((part**2).sum() for part in (spectral, background, lobe))
 
 
-def stored_numbers(compact: CompactBRDF | LobeTensor) -> int:
+def stored_numbers(compact: CompactBRDF | LobeHarmonics | LobeTensor) -> int:
     """Count all numbers that the `compact` group of a result holds, its axes included.
 
     The matrices of the spectral basis are not stored but for the vectors of "data": they follow
@@ -278,6 +280,8 @@ def stored_numbers(compact: CompactBRDF | LobeTensor) -> int:
     """
     if isinstance(compact, LobeTensor):
         return lobe_tensor.stored_numbers(compact)
+    if isinstance(compact, LobeHarmonics):
+        return lobe_harmonics.stored_numbers(compact)
     fields = ("theta_i", "background", "lobe_kind", "lobe_height", "lobe_width", "critical_angle", "lobe_peak_theta_o")
     held = sum(np.size(getattr(compact, name)) for name in (*fields, "status"))
     num_coefficients, num_harmonics = np.shape(compact.background)[1:]
@@ -285,7 +289,7 @@ def stored_numbers(compact: CompactBRDF | LobeTensor) -> int:
     return held + np.size(compact.basis.wavelength_nm) + num_coefficients + num_harmonics + vectors
 
 
-def compression(compact: CompactBRDF | LobeTensor) -> dict:
+def compression(compact: CompactBRDF | LobeHarmonics | LobeTensor) -> dict:
     """Numbers of the grid at the paper's 13 x 49 x wavelengths an incident angle over the numbers of the compact form.
 
     Only 13 x 49 - 60 of those directions are distinct, and half of them are mirror images.
@@ -294,7 +298,7 @@ def compression(compact: CompactBRDF | LobeTensor) -> dict:
     """
     grid = PAPER_DIRECTIONS * np.size(compact.basis.wavelength_nm)
     everything = {"compression_ratio": np.size(compact.theta_i) * grid / stored_numbers(compact)}
-    if isinstance(compact, LobeTensor):
+    if not isinstance(compact, CompactBRDF):
         return everything
     _, num_coefficients, num_harmonics = np.shape(compact.background)
     return everything | {"compression_ratio_paper": grid / ((num_harmonics + 2) * num_coefficients)}
@@ -397,4 +401,4 @@ def on_axes(result, theta_i: float, theta_o, phi_o) -> Float[np.ndarray, "theta_
 
 def _is_symmetric(result) -> bool:
     """Whether a result is the same on both sides of the plane of incidence."""
-    return isinstance(result, LobeTensor) or bool(getattr(result, "bilateral", False))
+    return isinstance(result, LobeHarmonics | LobeTensor) or bool(getattr(result, "bilateral", False))

@@ -165,3 +165,27 @@ class LobeTensor:
     status: Any  # [theta_i] Status; SKIPPED where an incident angle has no data
     half_angle_floor: float = 1e-4
     interpolate_theta_i: bool = True
+
+
+@pytree(static=("max_degree", "interpolate_theta_i"))
+class LobeHarmonics:
+    """Even spherical harmonics plus up to two lobes at every incident angle that has data.
+
+    The coefficients of the spectrum are background + sum over lobes of height * shape; the spectrum
+    is clipped at 0. `degree` is that of a coefficient's background, -1 where the whole coefficient
+    is 0. Kinds are places in `representation.lobe_family.SHAPES`; a lobe keeps its kind from one
+    incident angle to the next, or is absent (0). Harmonics are those with m >= 0, by l, then m.
+    """
+
+    theta_i: Any  # [theta_i] rad, nodes of the grid
+    fitted_theta_i: Any  # [fitted] rad, those of them that have data
+    basis: SpectralBasis
+    degree: Any  # [fitted, coefficient] int
+    background: Any  # [fitted, coefficient, harmonic] 1/sr
+    lobe_kind: Any  # [fitted, lobe] int, 0 = none
+    lobe_width: Any  # [fitted, lobe] rad^2 or without unit
+    lobe_peak_theta_o: Any  # [fitted, lobe] rad, at phi_o = pi
+    lobe_height: Any  # [fitted, lobe, coefficient] 1/sr
+    status: Any  # [theta_i] Status; SKIPPED where an incident angle has no data
+    max_degree: int = 8
+    interpolate_theta_i: bool = True

@@ -47,7 +47,7 @@ from sbrdf_jax.layout import (
 )
 from sbrdf_jax.metrics import METRIC_AXES, METRIC_UNITS
 from sbrdf_jax.quadrature import Quadrature
-from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralField
+from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, SpectralField
 from sbrdf_jax.schema import SCHEMA_NAME, SCHEMA_VERSION, open_result
 
 
@@ -57,7 +57,7 @@ class RunResult:
 
     gridded: GriddedBRDF
     field: SpectralField | None = None
-    compact: CompactBRDF | LobeTensor | None = None
+    compact: CompactBRDF | LobeHarmonics | LobeTensor | None = None
     metrics: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     clean: CleanReport | None = None
     input: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # JSON values: source, quantity, notes, ...
@@ -168,7 +168,7 @@ def load(path: str | os.PathLike) -> RunResult:
 
 
 @one_line_errors
-def load_stage(path: str | os.PathLike, stage: str) -> GriddedBRDF | CompactBRDF | LobeTensor:
+def load_stage(path: str | os.PathLike, stage: str) -> GriddedBRDF | CompactBRDF | LobeHarmonics | LobeTensor:
     """Read what evaluation of one stage needs, "grid" or "compact", and nothing else.
 
     Raises:

@@ -12,7 +12,8 @@ import numpy as np
 from sbrdf_jax.folds import LEAVE_ONE_OUT
 from sbrdf_jax.lobes import LOBE_KINDS
 from sbrdf_jax.progress import format_seconds
-from sbrdf_jax.records import STATUS_TEXT, CompactBRDF, LobeTensor, Status
+from sbrdf_jax.records import STATUS_TEXT, CompactBRDF, LobeHarmonics, LobeTensor, Status
+from sbrdf_jax.representation.lobe_family import SHAPES
 from sbrdf_jax.store import RunResult
 
 ERROR_COLUMNS = (
@@ -132,15 +133,24 @@ def done_table(result: RunResult) -> Table:
     return Table("What was done", ("", ""), tuple(rows))
 
 
-def compact_text(compact: CompactBRDF | LobeTensor) -> str:
+def compact_text(compact: CompactBRDF | LobeHarmonics | LobeTensor) -> str:
     """What a compact form is made of."""
     if isinstance(compact, LobeTensor):
         *ranks, count = np.shape(compact.core)
         sizes = " x ".join(map(str, ranks))
         return f"lobe tensor of ranks {sizes} (theta_i, theta_o, direction), {count} x {compact.basis.kind} spectra"
-    kinds = Counter(LOBE_KINDS[int(kind)] for kind in np.ravel(compact.lobe_kind))
-    lobes = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+    if isinstance(compact, LobeHarmonics):
+        count = np.shape(compact.degree)[1]
+        lobes = lobe_counts(SHAPES[int(kind)] for kind in np.ravel(compact.lobe_kind) if kind)
+        degree = int(np.max(compact.degree))
+        return f"even harmonics up to L = {degree}; lobes: {lobes}; {count} x {compact.basis.kind} spectra"
+    lobes = lobe_counts(LOBE_KINDS[int(kind)] for kind in np.ravel(compact.lobe_kind))
     return f"harmonics up to L = {compact.max_degree}; lobes: {lobes}"
+
+
+def lobe_counts(kinds: Iterable[str]) -> str:
+    """How many lobes there are of each kind."""
+    return ", ".join(f"{count} {kind}" for kind, count in Counter(kinds).most_common()) or "none"
 
 
 RATIOS = (

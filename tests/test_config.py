@@ -92,7 +92,6 @@ WRONG_KEYS_AND_VALUES = [
 
 NOT_BUILT = {
     "input.format": ["rgl-bsdf", "merl", "astm", "pab", "inplane", "alta"],
-    "represent.method": ["lobe_harmonics"],
     "scene": ["{}", "{wavelength_nm: {min: 500, max: 600}}", "{theta_i_deg: [0, 45]}"],
     "runtime.precision": ["float32"],
     "runtime.resume_from": ["old.h5"],
@@ -114,9 +113,9 @@ WRONG_OVERRIDES = [
     ("output.path=[", "command line: output.path=[: found text that is not YAML", "expected YAML"),
     ("grid.x=a\nb", "command line: grid.x=a b: unknown key", ""),
     (
-        "represent.method=lobe_harmonics",
-        "command line: represent.method=lobe_harmonics: found 'lobe",
-        "not available yet",
+        "represent.method=lobe_harmonic",
+        "command line: represent.method=lobe_harmonic: found 'lobe",
+        "did you mean 'lobe_harmonics'?",
     ),
     (
         "resample={method: paper, smoothness_weight: data}",

@@ -5,12 +5,12 @@ from typing import Any
 from sbrdf_jax.colour import ColourMatching
 from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.options import ErrorBudget, RepresentOptions
-from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeTensor, SpectralField
+from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, SpectralField
 
 
 def represent(
     field: SpectralField, options: RepresentOptions, gridded: GriddedBRDF | None = None
-) -> CompactBRDF | LobeTensor:
+) -> CompactBRDF | LobeHarmonics | LobeTensor:
     """Return the compact form of a field by the method that the options name.
 
     Args:
@@ -28,12 +28,13 @@ def represent_with_plan(
     gridded: GriddedBRDF | None = None,
     matching: ColourMatching | None = None,
     budget: ErrorBudget | None = None,
-) -> tuple[CompactBRDF | LobeTensor, dict[str, Any]]:
+) -> tuple[CompactBRDF | LobeHarmonics | LobeTensor, dict[str, Any]]:
     """Return what `represent` does, and what was computed and what was skipped, and why."""
-    # here, because evaluation, which `lobe_tensor` uses, imports the values of this package's records
-    from sbrdf_jax.representation import lobe_tensor, paper
+    # here, because evaluation, which these methods use, imports the values of this package's records
+    from sbrdf_jax.representation import lobe_harmonics, lobe_tensor, paper
 
     if options.method == "paper":
         return paper.represent(field, options)
+    method = lobe_harmonics if options.method == "lobe_harmonics" else lobe_tensor
     with one_blas_thread():
-        return lobe_tensor.represent(field, options, gridded, matching, budget)
+        return method.represent(field, options, gridded, matching, budget)

@@ -18,7 +18,8 @@ from sbrdf_jax.records import Status
 from sbrdf_jax.representation.background import fit_background
 from sbrdf_jax.representation.critical_angle import critical_candidates
 from sbrdf_jax.representation.directions import DirectionSet
-from sbrdf_jax.representation.lobe_fit import Lobe, best_start, fit_lobe, width_bank
+from sbrdf_jax.representation.lobe_bank import STEPS, fit_lobe_bank
+from sbrdf_jax.representation.lobe_fit import NOISE_POWER, STATIONARY, Lobe, fit_lobe, width_bank
 
 PAIR_BLOCK = 64  # searched before the next ones, to bound the memory
 PAIR_BATCH = 16  # in one call
@@ -98,8 +99,8 @@ def search_lanes(pairs: Pairs, kinds: LobeKinds, functions: Functions) -> Lanes:
     """
     weight = functions.weight
     critical_angle = critical_candidates(pairs.value, pairs.alpha, pairs.exponent, functions.even.shape[1])
-    even, height, width = _in_batches(
-        lambda *pair: _prepare(*pair, kinds.widths, functions.even, weight),
+    even, *lobe = _in_batches(
+        lambda *pair: _search_pairs(*pair, kinds.widths, functions.even, weight),
         PAIR_BATCH,
         (pairs.value, pairs.alpha, pairs.exponent, critical_angle),
     )
@@ -113,8 +114,7 @@ def search_lanes(pairs: Pairs, kinds: LobeKinds, functions: Functions) -> Lanes:
     odd_error = (pairs.odd[:, None] - odd @ functions.odd.T) ** 2 @ weight
     target = pairs.value[:, None] - even @ functions.even.T
     inside = pairs.alpha[:, None] <= critical_angle[..., None]
-    lobe = fit_lanes(target, inside, pairs.exponent[:, None], (height, width), kinds, weight)
-    return Lanes(critical_angle, even, odd, odd_error, target, inside, lobe)
+    return Lanes(critical_angle, even, odd, odd_error, target, inside, Lobe(*lobe))
 
 
 def fit_lanes(
@@ -166,8 +166,7 @@ def search(pairs: Pairs, kinds: LobeKinds, functions: Functions) -> Winners:
 def best_lanes(lanes: Lanes, pairs: Pairs, kinds: LobeKinds, weight: Float[np.ndarray, " direction"]) -> Winners:
     """Return the lane of each pair with the least error over all directions.
 
-    The winners are fitted on until each is stationary: the search stops its lanes early, because
-    one slow lane makes all others of its batch wait.
+    The winners that the search left before they were stationary are fitted on until they are.
     """
     shape = lanes.lobe.error.shape
     pair = np.arange(shape[0])
@@ -204,20 +203,28 @@ def _geometry(peak_theta, theta_o, phi_o):
 
 
 @jax.jit
-def _prepare(value, alpha, exponent, critical_angle, widths, functions, weight):
-    """Return even background [pair, candidate, even], start height and start width [pair, candidate, kind]."""
+def _search_pairs(value, alpha, exponent, critical_angle, widths, functions, weight):
+    """Return even background [pair, candidate, even], then the fields of `Lobe` [pair, candidate, kind]."""
 
-    def candidate(value, alpha, exponent, critical_angle):
+    def candidate(value, alpha, critical_angle):
         outside = alpha > critical_angle
         background = fit_background(value, outside, functions, weight)
-        inside_weight = jnp.where(outside, 0.0, weight)
-        start = jax.vmap(best_start, (None, None, 0, 0))(
-            value - functions @ background, inside_weight, exponent, widths
-        )
-        return background, *start
+        return background, value - functions @ background, jnp.where(outside, 0.0, weight)
 
-    of_pair = jax.vmap(candidate, (None, None, None, 0))
-    return jax.vmap(of_pair)(value, alpha, exponent, critical_angle)
+    of_pair = jax.vmap(candidate, (None, None, 0))
+    background, target, inside_weight = jax.vmap(of_pair)(value, alpha, critical_angle)
+    found = []
+    for kind in range(widths.shape[0]):
+        bank = jnp.broadcast_to(widths[kind], (value.shape[0], widths.shape[1]))
+        height, width, left, promised = fit_lobe_bank(target, inside_weight, exponent[:, kind], bank)
+        shape = jnp.exp(-exponent[:, kind, None] / width[..., None])
+        error = ((target - height[..., None] * shape) ** 2) @ weight
+        noise = jnp.finfo(error.dtype).eps ** (2 * NOISE_POWER)
+        ended = jnp.where(width <= widths[kind, 0], int(Status.CLAMPED), int(Status.OK))
+        status = jnp.where(promised <= STATIONARY * left + noise, ended, int(Status.MAX_STEPS))
+        status = jnp.where(jnp.isfinite(error), status, int(Status.NONFINITE))
+        found.append((height, width, status, jnp.full_like(status, STEPS), error))
+    return background, *(jnp.stack(parts, axis=-1) for parts in zip(*found, strict=True))
 
 
 @jax.jit

@@ -1,4 +1,4 @@
-"""Height and width of lobes by Levenberg-Marquardt, from the best of a bank of widths (section 4.2)."""
+"""Height and width of lobes by Levenberg-Marquardt (section 4.2), from what a bank of widths found."""
 
 from typing import Any, NamedTuple
 
@@ -36,20 +36,6 @@ class Lobe(NamedTuple):
 def width_bank(exponent_of_step: float) -> Float[np.ndarray, " width"]:
     """Return log-spaced widths from the narrowest that a grid shows, by s(alpha) at one step of it."""
     return np.geomspace(exponent_of_step / np.log(NARROWEST_DROP), WIDEST, BANK_SIZE)
-
-
-def best_start(
-    target: Float[Array, " direction"],
-    weight: Float[Array, " direction"],
-    exponent: Float[Array, " direction"],
-    widths: Float[Array, " width"],
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return height and width of the bank's best lobe; for each width, the best height is a ratio of two sums."""
-    shape = jnp.exp(-exponent[None, :] / widths[:, None])
-    along, energy = shape @ (weight * target), (shape * shape) @ weight
-    height = along / jnp.where(energy > 0, energy, 1.0)
-    best = jnp.argmax(height * along)
-    return height[best], widths[best]
 
 
 @jax.custom_jvp

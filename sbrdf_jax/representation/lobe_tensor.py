@@ -118,12 +118,13 @@ def represent(
         half_angle_floor=floor,
         interpolate_theta_i=field.interpolate_theta_i,
     )
-    return tensor, _plan(tensor, target, achieved, half)
+    plan = {"method": "lobe_tensor", "ranks": np.array(np.shape(tensor.core))}
+    return tensor, plan | make_plan(target, achieved, half)
 
 
 def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, floor: float, matching):
     """Return factors, scales, the basis that they are in, and what was measured of the target."""
-    vectors, to_coefficient = _channels(field.basis, half)
+    vectors, to_coefficient = channels_of(field.basis, half)
     place = np.isin(np.asarray(field.theta_i, np.float64), half.nodes.theta_i)
     rows = np.unique(np.concatenate([block.theta_i for block in half.blocks]))
     columns = np.unique(np.concatenate([block.theta_o for block in half.blocks]))
@@ -191,7 +192,7 @@ def _functions(theta_i, theta_o, phi_o, floor) -> Float[np.ndarray, "o p functio
     return direction_functions(np.full(mesh[0].shape, theta_i), *mesh, floor, np)
 
 
-def _channels(basis: SpectralBasis, half: HalfField) -> tuple[np.ndarray, np.ndarray]:
+def channels_of(basis: SpectralBasis, half: HalfField) -> tuple[np.ndarray, np.ndarray]:
     """Return orthonormal spectra [channel, wavelength], and the matrix from channels to coefficients.
 
     For "data" the vectors are found anew, between the nodes too: there may be peaks there.
@@ -208,7 +209,7 @@ def _no_core(basis: SpectralBasis) -> np.ndarray:
     return np.zeros((1, 1, 1, np.shape(basis.synthesis)[0]))
 
 
-def _plan(tensor: LobeTensor, target: Target, achieved: float, half: HalfField) -> dict[str, Any]:
+def make_plan(target: Target, achieved: float, half: HalfField) -> dict[str, Any]:
     """Say what was promised and what was measured."""
     met = is_met(target, achieved)
     warnings = []
@@ -218,8 +219,6 @@ def _plan(tensor: LobeTensor, target: Target, achieved: float, half: HalfField) 
         share = f"{100 * half.asymmetry:.2g} %"
         warnings.append(f"compact: {share} of the field is not symmetric to the plane of incidence and was dropped")
     return {
-        "method": "lobe_tensor",
-        "ranks": np.array(np.shape(tensor.core)),
         "promised": target.text,
         "measured": _in_words(target, achieved),
         "is_met": int(met),
