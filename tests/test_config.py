@@ -92,9 +92,7 @@ WRONG_KEYS_AND_VALUES = [
 
 NOT_BUILT = {
     "input.format": ["rgl-bsdf", "merl", "astm", "pab", "inplane", "alta"],
-    "scene": ["{}", "{wavelength_nm: {min: 500, max: 600}}", "{theta_i_deg: [0, 45]}"],
     "runtime.precision": ["float32"],
-    "runtime.resume_from": ["old.h5"],
 }
 
 WRONG_OVERRIDES = [

@@ -39,6 +39,9 @@ def specular(name):
     return jax.jit(lambda i, o, p, shape: model_value(model, i, o, p, shape, jnp.array([0.0, 1.0])))
 
 
+QUICK = ("lambert", "ward", "ggx")  # one of each number of parameters; compiling a fit takes some ten seconds
+
+
 @pytest.fixture
 def scattered(rng):
     """Directions [rad] at three incident angles."""
@@ -107,7 +110,7 @@ def test_never_nan_nor_negative_at_the_poles_and_at_grazing(name):
         assert np.isfinite(value).all() and (np.asarray(value) >= 0).all() and np.isfinite(slope).all()
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", [pytest.param(m, marks=() if m in QUICK else pytest.mark.slow) for m in MODELS])
 def test_planted_parameters_come_back(name, scattered):
     samples, amplitude = planted_samples(name, scattered)
     for fit in (fit_jointly(MODELS[name], samples), *each(name, samples)):

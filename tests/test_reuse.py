@@ -1,5 +1,7 @@
 """What an earlier result holds is not computed again, and is the same."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from problems import scattered_samples
@@ -9,16 +11,25 @@ import sbrdf_jax.resampling.guided as guided
 from sbrdf_jax.cli import main
 from sbrdf_jax.config import parse_config, resolve
 from sbrdf_jax.formats import write_samples
+from sbrdf_jax.grid import make_grid
+from sbrdf_jax.needs import everything
+from sbrdf_jax.options import GridOptions, ResampleOptions
+from sbrdf_jax.resampling import resample
 from sbrdf_jax.store import load
 
 GRID = ["grid.theta_i_step_deg=22.5", "grid.theta_o_step_deg=22.5", "grid.phi_o_step_deg=45", "output.report=false"]
+GUIDED = ResampleOptions("guided", "data", "factor", 1e-6)
+
+
+def measured():
+    return scattered_samples(np.random.default_rng(3), [0.0, 30.0, 60.0, 80.0], 60, 9)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A folder with a measurement, its config, and a result of three of its wavelengths."""
     folder = tmp_path_factory.mktemp("reuse")
-    samples = scattered_samples(np.random.default_rng(3), [0.0, 30.0, 60.0, 80.0], 60, 9)
+    samples = measured()
     write_samples(folder / "small.csv", samples)
     (folder / "config.yaml").write_text("input: {path: small.csv}\n")
     assert main(command(folder, "some.h5", scene_of(samples.wavelength_nm[[1, 4, 7]]))) == 0
@@ -90,11 +101,14 @@ def test_fewer_of_a_result_are_taken_from_it(folder, solved):
 
 
 def test_another_grid_keeps_the_fit(folder, solved):
-    nm = load(folder / "some.h5").gridded.wavelength_nm
-    finer = ["grid.phi_o_step_deg=30"]
-    assert main(command(folder, "finer.h5", scene_of(nm), *finer, earlier="some.h5")) == 0
+    known = load(folder / "some.h5").gridded
+    samples, chosen = measured(), np.isin(np.arange(9), [1, 4, 7])
+    finer = make_grid(samples, GridOptions(22.5, 22.5, 30.0), bilateral=True)
+    needs = dataclasses.replace(everything(finer, 9), wavelength=chosen)
+    found = resample(samples, finer, GUIDED, needs=needs, known=known)
     assert solved["estimated"] == [] and sum(solved["solved"]) == 0
-    assert load(folder / "finer.h5").gridded.brdf.shape[2] == 13
+    assert found.brdf.shape[2] == 13
+    np.testing.assert_allclose(found.brdf[:, :, ::3], np.asarray(known.brdf)[:, :, ::2], rtol=1e-9, atol=1e-12)
 
 
 def test_a_change_of_output_recomputes_nothing(folder, solved, monkeypatch):
@@ -112,14 +126,16 @@ def test_a_change_of_output_recomputes_nothing(folder, solved, monkeypatch):
     assert f"resume_from: {folder / 'some.h5'}" in found.config
 
 
-def test_method_paper_takes_over_wavelengths(folder):
-    paper = ["resample.method=paper"]
-    nm = load_wavelengths(folder)
-    assert main(command(folder, "paper1.h5", scene_of(nm[:4]), *paper)) == 0
-    assert main(command(folder, "paper2.h5", scene_of(nm[2:7]), *paper, earlier="paper1.h5")) == 0
-    first, second = load(folder / "paper1.h5").gridded, load(folder / "paper2.h5").gridded
-    np.testing.assert_array_equal(second.brdf[..., :2], first.brdf[..., 2:])
-    assert np.isfinite(second.brdf).all() and (second.kkt_residual <= 1e-8).all()
+def test_method_paper_takes_over_wavelengths():
+    samples, options = measured(), ResampleOptions("paper", 1.0, "factor", 1e-8)
+    grid = make_grid(samples, GridOptions(22.5, 22.5, 45.0), bilateral=True)
+    whole = everything(grid, 9)
+    some, more = (dataclasses.replace(whole, wavelength=np.isin(np.arange(9), w)) for w in ([0, 1, 2], [1, 2, 3, 4]))
+    first = resample(samples, grid, options, needs=some)
+    second = resample(samples, grid, options, needs=more, known=first)
+    np.testing.assert_array_equal(second.brdf[..., :2], np.asarray(first.brdf)[..., 1:])
+    np.testing.assert_array_equal(second.wavelength_nm, samples.wavelength_nm[1:5])
+    assert np.isfinite(second.brdf).all() and (np.asarray(second.kkt_residual) <= 1e-8).all()
 
 
 def test_what_cannot_be_reused_is_said(folder, capsys, solved):

@@ -207,6 +207,7 @@ def test_method_paper_solves_a_wavelength_as_the_full_run_does(samples, grid):
     np.testing.assert_allclose(found.brdf, wanted, rtol=0, atol=EQUAL["paper"] * wanted.max())
 
 
+@pytest.mark.slow
 def test_lanes_of_method_paper_are_those_of_the_full_run(samples, tmp_path):
     """The coefficients are the same, and so is the compact form of the incident angles that are left."""
     results = {}

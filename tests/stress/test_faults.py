@@ -1,13 +1,14 @@
 """Kills, full disks, closed folders, rivals and lost terminals: a whole file or none, and one clear line."""
 
+import json
 import multiprocessing
 import os
-import pty
 import random
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -135,35 +136,20 @@ def test_a_run_killed_at_random_leaves_no_half_file_and_runs_again(words, tmp_pa
 
 
 def at_a_terminal(command, environment, log, act):
-    """Run a command at a terminal of its own, `act` once it has begun, and return its exit code and what it showed."""
-    pid, terminal = pty.fork()
-    if pid == 0:
-        os.execvpe(command[0], command, environment)
-    deadline = time.monotonic() + 60
-    while not log.exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    act(terminal)
-    shown = b""
-    while True:
-        try:
-            part = os.read(terminal, 4096)
-        except OSError:  # the other end, or this one, is closed
-            break
-        if not part:
-            break
-        shown += part
-    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), shown.decode()
+    """Run a command at a terminal of its own, `act` once it has begun; its exit code and what it showed."""
+    words = [sys.executable, str(Path(__file__).with_name("terminal.py")), act, str(log), *command]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
+    found = json.loads(done.stdout)
+    return found["code"], found["shown"]
 
 
 @pytest.mark.parametrize(("act", "code"), [("interrupt", 130), ("hang up", -signal.SIGHUP)])
 def test_an_interrupted_or_lost_terminal_leaves_nothing_half_written(act, code, words, tmp_path):
     command, environment = words
-    acts = {"interrupt": lambda terminal: os.write(terminal, b"\x03"), "hang up": os.close}
     output = tmp_path / "x.h5"
     fine = ["grid.theta_o_step_deg=7.5", "grid.phi_o_step_deg=7.5"]  # not compiled yet: it takes a while
-    found, shown = at_a_terminal(
-        [*command, *fine, f"output.path={output}"], environment, tmp_path / "x.h5.log", acts[act]
-    )
+    log = tmp_path / "x.h5.log"
+    found, shown = at_a_terminal([*command, *fine, f"output.path={output}"], environment, log, act)
     assert found == code, shown
     assert [path.name for path in tmp_path.iterdir()] == ["x.h5.log"]
     assert "Traceback" not in shown
