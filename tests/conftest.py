@@ -3,6 +3,9 @@
 import os
 from pathlib import Path
 
+# Compiling takes most of the tests' time, so LLVM's optimisation is off; `scripts/nightly.sh` has it on.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+
 import jax
 import jaxtyping
 import numpy as np
