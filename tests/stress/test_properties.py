@@ -34,6 +34,7 @@ def check(prove, examples: int, **strategies) -> None:
 
 
 KEPT = Kept()
+WELL_CONDITIONED = 30.0  # smoothness weights up to it: its square is the condition number that it adds
 
 
 def fit(samples: RawSamples, *, weight: float = 1.0, window: Window = "factor") -> GriddedBRDF:
@@ -137,13 +138,16 @@ def test_more_smoothing_is_smoother(examples):
     rows, index = second_difference_rows(grid), grid.unknown_index.reshape(-1)
 
     def roughness(weight):
-        nodes = np.asarray(fit(usual(), weight=weight).brdf)[:, :, :-1].reshape(len(index), -1)
-        unknown = np.zeros((grid.num_unknowns, nodes.shape[1]))
-        unknown[index] = nodes
-        return ((rows @ unknown) ** 2).sum(axis=0)
+        found = resample(usual(), grid, ResampleOptions("paper", weight, "factor", 1e-8), kept=KEPT)
+        unknown = np.zeros((grid.num_unknowns, len(found.status)))
+        unknown[index] = np.asarray(found.brdf)[:, :, :-1].reshape(len(index), -1)
+        solved = np.asarray(found.status) == Status.OK
+        assert solved.all() or weight > WELL_CONDITIONED  # beyond, a lane may say that it ran out of steps
+        return ((rows @ unknown) ** 2).sum(axis=0), solved
 
     def prove(weight, ratio):
-        assert (roughness(weight * ratio) <= roughness(weight) * (1 + SOLVED)).all()
+        (more, one), (less, other) = roughness(weight * ratio), roughness(weight)
+        assert (more <= less * (1 + SOLVED))[one & other].all()
 
     check(prove, examples, weight=st.floats(1e-2, 10), ratio=st.floats(1.01, 1e3))
 
