@@ -1,4 +1,4 @@
-"""Fits of one lobe to many lanes: the own batched Levenberg-Marquardt beside SciPy's least squares in a loop."""
+"""Fits of one lobe to many lanes: the bank of widths, optimistix in a batch, and SciPy in a loop."""
 
 from collections.abc import Iterator
 
@@ -19,7 +19,8 @@ def records(lanes: int, *, loop_lanes: int, repeats: int = 3) -> Iterator[Record
 
     from sbrdf_jax.angles import angle_between
     from sbrdf_jax.lobes import LOBE_KINDS, lobe_exponents
-    from sbrdf_jax.representation.lobe_fit import best_start, fit_lobe, width_bank
+    from sbrdf_jax.representation.lobe_bank import fit_lobe_bank
+    from sbrdf_jax.representation.lobe_fit import fit_lobe, width_bank
 
     theta_o, phi_o = (
         a.ravel() for a in np.meshgrid(np.radians(np.arange(0, 90.1, 7.5)), np.radians(np.arange(0, 181, 7.5)))
@@ -35,15 +36,26 @@ def records(lanes: int, *, loop_lanes: int, repeats: int = 3) -> Iterator[Record
     bank = width_bank(np.radians(7.5) ** 2)
     limits = jnp.asarray(bank[[0, -1]])
 
+    columns = jnp.exp(-exponent / bank[:, None])
+    size = jnp.sum(columns**2, axis=1)
+
+    def best_start(lane):
+        along = columns @ lane
+        best = jnp.argmax(along**2 / size)
+        return along[best] / size[best], jnp.asarray(bank)[best]
+
     def one(lane):
-        start = best_start(lane, weight, exponent, jnp.asarray(bank))
-        return fit_lobe(lane, inside, exponent, weight, start, limits)
+        return fit_lobe(lane, inside, exponent, weight, best_start(lane), limits)
+
+    whole = target[None], jnp.ones_like(target)[None], exponent[None], jnp.asarray(bank)[None]
+    found, timing = timed(lambda: fit_lobe_bank(*whole), repeats)
+    yield _record("own, bank of widths", timing, np.asarray(found.width)[0], width, "")
 
     batch = jax.jit(jax.vmap(one))
     found, timing = timed(lambda: batch(target), repeats)
-    yield _record("own, batched", timing, np.asarray(found.width), width, "")
+    yield _record("optimistix, batched", timing, np.asarray(found.width), width, "")
 
-    starts = jax.jit(jax.vmap(lambda lane: best_start(lane, weight, exponent, jnp.asarray(bank))))(target[:loop_lanes])
+    starts = jax.jit(jax.vmap(best_start))(target[:loop_lanes])
 
     def loop():
         widths = []
