@@ -55,7 +55,7 @@ def write_footprint(path: str | os.PathLike, axes: tuple[np.ndarray, ...], count
 
 
 def widen(needed: Bool[np.ndarray, "theta_i theta_o phi_o"]) -> Bool[np.ndarray, "theta_i theta_o phi_o"]:
-    """Add the neighbours of every cell along each axis; at a pole every azimuth is one cell."""
+    """Add the neighbours of every cell, along each axis and across."""
     for axis in range(3):
         moved = np.moveaxis(needed, axis, 0)
         wide = moved.copy()

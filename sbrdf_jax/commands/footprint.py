@@ -29,6 +29,8 @@ def run(args: argparse.Namespace) -> int:
 
     if not (0 < args.step <= 45 and abs(90 / args.step - round(90 / args.step)) < 1e-9):
         raise UserError(f"--step: found {args.step:g}; expected a step that divides 90 degrees, such as 7.5")
+    if Path(args.output).suffix == ".png":
+        raise UserError(f"--output: found {args.output}, the name of its picture; expected FOOTPRINT.h5")
     if args.width < 1 or args.samples < 1:
         raise UserError(f"--width, --samples: found {args.width} and {args.samples}; expected at least 1 each")
     from sbrdf_jax.footprints import find_footprint

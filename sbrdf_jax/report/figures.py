@@ -207,10 +207,11 @@ def _of_physics_and_solver(result: RunResult) -> Iterator[_Sketch]:
 def measure_samples(samples: RawSamples, grid: GriddedBRDF) -> list[CutoffSpectrum]:
     """Measure samples and the residual of their fit against the cut-off of the grid, at the wavelengths of both."""
     live = finite_wavelengths(grid)
-    live = live[np.isfinite(samples.value[:, live]).all(axis=0)]
+    value = samples.value[:, np.searchsorted(samples.wavelength_nm, np.asarray(grid.wavelength_nm)[live])]
+    finite = np.isfinite(value).all(axis=0)
+    live, value, residual = live[finite], value[:, finite], None
     if not live.size:
         return []
-    value, residual = samples.value[:, live], None
     if grid.method == "paper":  # eq. (6) is fitted without the window
         fitted = dataclasses.replace(
             grid,
@@ -226,7 +227,9 @@ def measure_samples(samples: RawSamples, grid: GriddedBRDF) -> list[CutoffSpectr
         samples.phi_o,
         value,
         residual=residual,
-        theta_i_step=float(grid.theta_i[1] - grid.theta_i[0]) if grid.interpolate_theta_i else 0.0,
+        theta_i_step=float(grid.theta_i[1] - grid.theta_i[0])
+        if np.size(grid.theta_i) > 1 and grid.interpolate_theta_i
+        else 0.0,
         theta_o_step=steps[0],
         phi_o_step=steps[1],
     )

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from sbrdf_jax import colour
 from sbrdf_jax.evaluation import evaluate_on_axes
+from sbrdf_jax.metrics import live_wavelengths
 from sbrdf_jax.records import GriddedBRDF
 
 PAPER_WAVELENGTH_NM = 550.0
@@ -31,8 +32,8 @@ def pick_wavelength(wavelength_nm: Float[np.ndarray, " wavelength"], wanted: flo
 
 
 def finite_wavelengths(gridded: GriddedBRDF) -> np.ndarray:
-    """Indices of the wavelengths that are finite at every node."""
-    return np.flatnonzero(np.isfinite(np.asarray(gridded.brdf)).all(axis=(0, 1, 2)))
+    """Indices of the wavelengths that are finite at every node that is needed."""
+    return np.flatnonzero(live_wavelengths(gridded))
 
 
 def pick_incidences(gridded: GriddedBRDF) -> list[Picked]:

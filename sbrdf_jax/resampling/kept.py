@@ -11,7 +11,7 @@ from sbrdf_jax.multipliers import InverseNormal, invert_normal
 from sbrdf_jax.options import ResampleOptions
 from sbrdf_jax.records import RawSamples
 from sbrdf_jax.resampling.guided import Centres, Estimates, GuidedField, estimate_whole, place_centres
-from sbrdf_jax.resampling.guided.estimates import restore_estimates
+from sbrdf_jax.resampling.guided.estimates import live_part, restore_estimates
 from sbrdf_jax.resampling.normal import TiedGridNormal
 
 
@@ -62,7 +62,7 @@ class Kept:
             if stored is None:
                 found = estimate_whole(samples, options, centres, report)
             else:
-                found = restore_estimates(stored, samples, centres)
+                found = restore_estimates(stored, live_part(samples), centres)
             self._estimates = key, found
         return found
 

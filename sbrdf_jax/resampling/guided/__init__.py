@@ -4,7 +4,6 @@ The field is fitted in a generalised logarithm, by bounded least squares on two 
 grids, for all wavelengths at once; everything that depends on angles alone is shared.
 """
 
-import dataclasses
 from collections.abc import Callable
 
 import jax.numpy as jnp
@@ -17,7 +16,7 @@ from sbrdf_jax.records import GriddedBRDF, RawSamples, Status
 from sbrdf_jax.resampling.extrapolation import extrapolated_nodes
 from sbrdf_jax.resampling.guided.centres import PADDING_NOISE, Centres, place_centres
 from sbrdf_jax.resampling.guided.coordinates import guided_coordinates
-from sbrdf_jax.resampling.guided.estimates import Estimates, estimate
+from sbrdf_jax.resampling.guided.estimates import Estimates, estimate, live_part, live_wavelengths
 from sbrdf_jax.resampling.guided.field import GuidedField
 from sbrdf_jax.resampling.guided.fit import GuidedFit, solve_field
 from sbrdf_jax.resampling.guided.lanes import join_fits, spread, take_fit, with_dead_wavelengths
@@ -47,10 +46,8 @@ def estimate_whole(
     samples: RawSamples, options: ResampleOptions, centres: Centres, report: Callable[[str], None] | None = None
 ) -> Estimates:
     """Estimate what depends on the whole measurement, from the wavelengths that are finite and hold light."""
-    live = _live(samples)
-    part = dataclasses.replace(samples, wavelength_nm=samples.wavelength_nm[live], value=samples.value[:, live])
     weight = None if isinstance(options.smoothness_weight, str) else float(options.smoothness_weight)
-    return estimate(part, weight, centres, report)
+    return estimate(live_part(samples), weight, centres, report)
 
 
 def fit_field(
@@ -78,7 +75,7 @@ def fit_field(
     centres = centres or place_centres(samples)
     estimates = estimates or estimate_whole(samples, options, centres, report)
     needed = np.ones(len(samples.wavelength_nm), bool) if needed is None else needed
-    finite, live = np.isfinite(samples.value).all(axis=0), _live(samples)
+    finite, live = np.isfinite(samples.value).all(axis=0), live_wavelengths(samples)
     wanted = samples.wavelength_nm[needed & live]
     held = np.zeros(0) if known is None else np.intersect1d(wanted, known.field.wavelength_nm)
     fresh = np.isin(estimates.wavelength_nm, wanted) & ~np.isin(estimates.wavelength_nm, held)
@@ -193,8 +190,3 @@ def describe_spike(field: GuidedField) -> list[str]:
         f"guided: a mirror spike of about {width:.1f} degrees at {spiky.sum()} of {len(spiky)} wavelengths, seen by "
         f"{near.sum()} directions: too few for its shape; the lobe model alone carries it"
     ]
-
-
-def _live(samples: RawSamples) -> np.ndarray:
-    """Mask of the wavelengths that are finite and hold a positive value."""
-    return np.isfinite(samples.value).all(axis=0) & (samples.value > 0).any(axis=0)

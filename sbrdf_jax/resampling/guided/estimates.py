@@ -3,6 +3,7 @@
 It is the same whatever a scene needs of the measurement, and is kept for its next scene.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -49,6 +50,17 @@ class Estimates(NamedTuple):
     residual: np.ndarray  # [centre, wavelength] z minus the lobe model's
     model: np.ndarray  # [centre, wavelength] z of the lobe model
     node_variance: dict[bytes, np.ndarray]  # of the nodes that were asked for, by grid: the same at every wavelength
+
+
+def live_wavelengths(samples: RawSamples) -> np.ndarray:
+    """Mask of the wavelengths that are finite and hold a positive value."""
+    return np.isfinite(samples.value).all(axis=0) & (samples.value > 0).any(axis=0)
+
+
+def live_part(samples: RawSamples) -> RawSamples:
+    """Return the samples at the wavelengths that can be estimated and solved."""
+    live = live_wavelengths(samples)
+    return dataclasses.replace(samples, wavelength_nm=samples.wavelength_nm[live], value=samples.value[:, live])
 
 
 def estimate(
@@ -145,7 +157,7 @@ def restore_estimates(field: GuidedField, samples: RawSamples, centres: Centres)
 
     Args:
         field: Of an earlier run on the same samples, at whatever wavelengths.
-        samples: As for `estimate`.
+        samples: As for `estimate`: `live_part` of them.
         centres: Where the samples are.
     """
     floor = float(field.floor)

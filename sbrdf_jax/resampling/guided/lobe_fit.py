@@ -132,8 +132,7 @@ def _fit_shape(problem: _Problem, log_amplitude: np.ndarray) -> Float[np.ndarray
     def loss_of(residual, shape):
         return _loss(residual, weight).sum() + float(pull_of_prior @ (shape - PRIOR) ** 2)
 
-    terms = terms_of(shape, problem.at, np)
-    residual, parts, slope = _residual(problem, terms, log_amplitude)
+    residual, parts, slope = _residual(problem, terms_of(shape, problem.at, np), log_amplitude)
     loss, fresh = loss_of(residual, shape), True
     for _ in range(SHAPE_STEPS):
         if fresh:
@@ -153,8 +152,7 @@ def _fit_shape(problem: _Problem, log_amplitude: np.ndarray) -> Float[np.ndarray
         new_shape = np.clip(shape + move, LOWER, UPPER)
         step = -(solved[:, :, -1] + solved[:, :, :-1] @ (new_shape - shape))
         new_amplitude = problem.clip(log_amplitude + np.clip(step, -LARGEST_CHANGE, LARGEST_CHANGE))
-        new_terms = terms_of(new_shape, problem.at, np)
-        found = _residual(problem, new_terms, new_amplitude)
+        found = _residual(problem, terms_of(new_shape, problem.at, np), new_amplitude)
         new_loss = loss_of(found[0], new_shape)
         fresh = bool(new_loss < loss)
         if not fresh:
@@ -163,7 +161,7 @@ def _fit_shape(problem: _Problem, log_amplitude: np.ndarray) -> Float[np.ndarray
                 break
             continue
         converged = loss - new_loss < STOP * loss
-        shape, log_amplitude, terms, loss = new_shape, new_amplitude, new_terms, new_loss
+        shape, log_amplitude, loss = new_shape, new_amplitude, new_loss
         residual, parts, slope = found
         damping = max(damping / 5, LEAST_DAMPING)
         if converged:
