@@ -137,19 +137,13 @@ def error_at_nodes(
     counts; wavelengths count where the whole grid is finite, which are those of the compact form.
     """
     live, needed = live_wavelengths(gridded), needed_nodes(gridded)
-    mesh = np.meshgrid(np.asarray(gridded.theta_o), np.asarray(gridded.phi_o), indexing="ij")
     counts = needed.any(axis=(1, 2))
     error_energy, energy, deviation, delta_e = [], [], [], []
     for i, theta_i in enumerate(np.asarray(gridded.theta_i)):
         if not counts[i]:
             continue
         original = np.asarray(gridded.brdf[i])[needed[i]][:, live]
-        if needed[i].all():
-            reconstructed = on_axes(compact, theta_i, gridded.theta_o, gridded.phi_o).reshape(original.shape)
-        else:
-            theta_o, phi_o = (axis[needed[i]] for axis in mesh)
-            angles = np.full(theta_o.shape, theta_i), theta_o, phi_o
-            reconstructed = evaluate_in_chunks(compact, *angles, chunk_size=CHUNK_SIZE)
+        reconstructed = _where(compact, theta_i, gridded.theta_o, gridded.phi_o, needed[i])
         error_energy.append(((reconstructed - original) ** 2).sum())
         energy.append((original**2).sum())
         deviation.append(relative_deviation(reconstructed, original).ravel())
@@ -201,18 +195,12 @@ def error_between(compact: CompactBRDF | LobeHarmonics | LobeTensor, gridded: Gr
     theta_i = np.asarray(gridded.theta_i)
     theta_o, phi_o = midpoints(gridded.theta_o), midpoints(gridded.phi_o)
     live, cell = live_wavelengths(gridded), cells_between(needed_nodes(gridded))
-    mesh = np.meshgrid(theta_o, phi_o, indexing="ij")
 
     def at(incidence, cells):
-        if cells.all():
-            original = on_axes(gridded, incidence, theta_o, phi_o)[..., live]
-            reconstructed = on_axes(compact, incidence, theta_o, phi_o)
-        elif cells.any():
-            angles = np.full(int(cells.sum()), incidence), *(axis[cells] for axis in mesh)
-            original = evaluate_in_chunks(gridded, *angles)[..., live]
-            reconstructed = evaluate_in_chunks(compact, *angles, chunk_size=CHUNK_SIZE)
-        else:
+        if not cells.any():
             return np.nan
+        original = _where(gridded, incidence, theta_o, phi_o, cells)[..., live]
+        reconstructed = _where(compact, incidence, theta_o, phi_o, cells)
         return relative_error(((reconstructed - original) ** 2).sum(), (original**2).sum())
 
     midway = midpoints(theta_i)
@@ -397,6 +385,16 @@ def on_axes(result, theta_i: float, theta_o, phi_o) -> Float[np.ndarray, "theta_
         return evaluate_on_axes(result, np.array([theta_i]), np.asarray(theta_o), phi_o)[0][:, back]
     mesh = np.meshgrid(np.asarray(theta_o), phi_o, indexing="ij")
     return evaluate_in_chunks(result, np.full(mesh[0].shape, theta_i), *mesh, chunk_size=CHUNK_SIZE)[:, back]
+
+
+def _where(result, theta_i: float, theta_o, phi_o, needed: Bool[np.ndarray, "theta_o phi_o"]) -> np.ndarray:
+    """Evaluate one incident angle where a mask of theta_o and phi_o [rad] is true: [direction, wavelength]."""
+    if needed.all():
+        value = on_axes(result, theta_i, theta_o, phi_o)
+        return value.reshape(-1, value.shape[-1])
+    mesh = np.meshgrid(np.asarray(theta_o), np.asarray(phi_o), indexing="ij")
+    angles = (axis[needed] for axis in mesh)
+    return evaluate_in_chunks(result, np.full(int(needed.sum()), theta_i), *angles, chunk_size=CHUNK_SIZE)
 
 
 def _is_symmetric(result) -> bool:

@@ -21,7 +21,7 @@ from sbrdf_jax.representation import represent_with_plan
 from sbrdf_jax.resampling import resample
 from sbrdf_jax.resampling.guided import describe_fit
 from sbrdf_jax.resampling.kept import Kept
-from sbrdf_jax.reuse import Earlier, is_whole_answer, part_of, read_earlier, usable_grid
+from sbrdf_jax.reuse import Earlier, part_of, read_earlier
 from sbrdf_jax.runtime import compile_clock
 from sbrdf_jax.scene import find_needs, restrict_wavelengths
 from sbrdf_jax.store import RunResult
@@ -66,7 +66,6 @@ def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
         place = np.flatnonzero(needs.wavelength)
         quadrature = choose_quadrature(raw.wavelength_nm[place], cleaned.samples.value[:, place], options.scene)
         needs = restrict_wavelengths(needs, np.isin(np.arange(len(needs.wavelength)), place[quadrature.index]))
-    earlier = None if options.runtime.resume_from is None else read_earlier(options.runtime.resume_from)
     dead = np.isin(raw.wavelength_nm, cleaned.report.dead_wavelength_nm)
     num_live = int(np.sum(needs.wavelength & ~dead))
     allowed = coefficients_allowed(num_live, int(options.encode.coefficients), options.encode.basis)
@@ -77,10 +76,12 @@ def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
     warnings = [f"not measured: {text}" for text in cleaned.report.coverage.missing]
     if allowed.warning:
         warnings.append(allowed.warning)
-    if earlier is not None and usable_grid(earlier, raw, options) is None:
-        reason = "another source, other versions or other options of input, grid or resample"
-        warnings.append(f"runtime.resume_from: {options.runtime.resume_from}: nothing of it is used: {reason}")
-        earlier = None
+    resume_from, earlier = options.runtime.resume_from, None
+    if resume_from is not None:
+        earlier = read_earlier(resume_from, raw, options, needs, folds)
+        if earlier is None:
+            reason = "another source, other versions or other options of input, grid or resample"
+            warnings.append(f"runtime.resume_from: {resume_from}: nothing of it is used: {reason}")
     return Prepared(cleaned, grid, rows, tuple(warnings), folds, needs, cost, quadrature, earlier)
 
 
@@ -99,12 +100,12 @@ def process(
     Returns:
         The result, but for what only its caller knows: config text, time of creation, versions.
     """
-    if ready.earlier is not None and is_whole_answer(ready.earlier, raw, options):
+    if ready.earlier is not None and ready.earlier.is_whole:
         progress.say(f"{options.runtime.resume_from} holds all of this: nothing is computed")
         return dataclasses.replace(ready.earlier.result, timing={})
     timing: dict[str, dict[str, float]] = {}
     samples, report, needs = ready.cleaned.samples, ready.cleaned.report, ready.needs
-    known = None if ready.earlier is None else usable_grid(ready.earlier, raw, options)
+    known = None if ready.earlier is None else ready.earlier.result.gridded
     with _timed(progress, timing, "resample"):
         gridded = None if known is None else part_of(known, ready.grid, needs, samples.wavelength_nm)
         if gridded is None:

@@ -1,12 +1,14 @@
 """What an earlier result holds that a run need not compute again: keyed by its source and the options that matter."""
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sbrdf_jax.config import parse_config
 from sbrdf_jax.errors import UserError
+from sbrdf_jax.folds import K_FOLD, Folds
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.needs import Needs
 from sbrdf_jax.options import OutputOptions, RunOptions, RuntimeOptions
@@ -18,50 +20,61 @@ from sbrdf_jax.store import RunResult, load
 
 
 class Earlier(NamedTuple):
-    """An earlier result, and the options that made it."""
+    """An earlier result of the same source, code and options of its grid."""
 
     result: RunResult
-    options: RunOptions
+    is_whole: bool  # the other options are the same too, but for where and how it is written
 
 
-def read_earlier(path: str) -> Earlier:
-    """Read the result that `runtime.resume_from` names.
+def read_earlier(
+    path: str, raw: RawSamples, options: RunOptions, needs: Needs, folds: Mapping[str, Folds]
+) -> Earlier | None:
+    """Read the result that `runtime.resume_from` names; None where nothing of it can be used.
+
+    Args:
+        path: The result.
+        raw: The measurement of this run.
+        options: Its options.
+        needs: What its scene needs: the files that a scene names may have changed.
+        folds: Its folds by scheme, whose file may have changed too.
 
     Raises:
         UserError: There is no such result, or it cannot be read.
     """
     try:
         result = load(path)
-        return Earlier(result, parse_config(result.config, name=path))
+        made_with = parse_config(result.config, name=path)
     except UserError as error:
         raise UserError(f"runtime.resume_from: {error}") from None
-
-
-def is_whole_answer(earlier: Earlier, raw: RawSamples, options: RunOptions) -> bool:
-    """Whether nothing but where and how the result is written has changed."""
-
-    def relevant(given: RunOptions) -> RunOptions:
-        without_path = dataclasses.replace(given.input, path="-")
-        return dataclasses.replace(given, input=without_path, output=OutputOptions(), runtime=RuntimeOptions())
-
-    return _is_same_source(earlier, raw) and relevant(earlier.options) == relevant(options)
-
-
-def usable_grid(earlier: Earlier, raw: RawSamples, options: RunOptions) -> GriddedBRDF | None:
-    """Return the earlier grid stage where its source and the options of its method are those of this run."""
-
-    def relevant(given: RunOptions):
-        steps = given.grid if given.resample.method == "paper" else given.grid.reciprocal
-        return dataclasses.replace(given.input, path="-"), steps, given.resample
-
-    same = _is_same_source(earlier, raw) and relevant(earlier.options) == relevant(options)
-    return earlier.result.gridded if same else None
-
-
-def _is_same_source(earlier: Earlier, raw: RawSamples) -> bool:
-    ours, theirs = versions(), earlier.result.versions
+    ours, theirs = versions(), result.versions
     same_code = all(ours.get(name) == theirs.get(name) for name in ("sbrdf_jax", "jax", "numpy"))
-    return same_code and earlier.result.source_sha256 == raw.source_sha256 != ""
+    same_source = result.source_sha256 == raw.source_sha256 != ""
+    if not (same_code and same_source and _of_grid(made_with) == _of_grid(options)):
+        return None
+    same_answer = _of_answer(made_with) == _of_answer(options)
+    return Earlier(result, same_answer and _has_same_files(result, needs, folds))
+
+
+def _of_grid(options: RunOptions) -> tuple[Any, ...]:
+    """Options that decide the grid stage; where a field of its own is read off, not the nodes'."""
+    steps = options.grid if options.resample.method == "paper" else options.grid.reciprocal
+    return dataclasses.replace(options.input, path="-"), steps, options.resample
+
+
+def _of_answer(options: RunOptions) -> RunOptions:
+    """Options that decide the answer."""
+    without_path = dataclasses.replace(options.input, path="-")
+    return dataclasses.replace(options, input=without_path, output=OutputOptions(), runtime=RuntimeOptions())
+
+
+def _has_same_files(result: RunResult, needs: Needs, folds: Mapping[str, Folds]) -> bool:
+    """Whether the files that a config names, a mask's, directions' or folds', said the same when it was made."""
+    scene = result.plan.get("scene", {})
+    wanted = {"node_needed": needs.node, "wavelength_needed": needs.wavelength}
+    if not all(name in scene and np.array_equal(scene[name] > 0, mask) for name, mask in wanted.items()):
+        return False
+    given = folds.get(K_FOLD)
+    return given is None or np.array_equal(result.validation.get("fold", ()), given.label)
 
 
 def part_of(known: GriddedBRDF, grid: Grid, needs: Needs, wavelength_nm: np.ndarray) -> GriddedBRDF | None:

@@ -12,6 +12,7 @@ from sbrdf_jax.cli import main
 from sbrdf_jax.config import parse_config, resolve
 from sbrdf_jax.formats import write_samples
 from sbrdf_jax.grid import make_grid
+from sbrdf_jax.masks import write_footprint
 from sbrdf_jax.needs import everything
 from sbrdf_jax.options import GridOptions, ResampleOptions
 from sbrdf_jax.resampling import resample
@@ -124,6 +125,36 @@ def test_a_change_of_output_recomputes_nothing(folder, solved, monkeypatch):
     np.testing.assert_array_equal(found.gridded.brdf, some.gridded.brdf)
     np.testing.assert_array_equal(found.compact.core, some.compact.core)
     assert f"resume_from: {folder / 'some.h5'}" in found.config
+
+
+def test_a_mask_that_has_changed_is_computed_anew(folder, solved):
+    grid = make_grid(measured(), GridOptions(22.5, 22.5, 45.0), bilateral=True)
+    axes = (grid.theta_i, grid.theta_o, grid.phi_o[: grid.num_azimuths])
+    count, nm = np.zeros(tuple(map(len, axes)), int), load(folder / "some.h5").gridded.wavelength_nm
+    scene = f"scene={{footprint: {folder / 'foot.h5'}, wavelength_nm: {list(map(float, nm))}}}"
+    sizes = []
+    for place, output in ((1, "first.h5"), (3, "second.h5")):
+        count[place, 1, 2] = 1
+        write_footprint(folder / "foot.h5", axes, {"paint": count})
+        earlier = "some.h5" if place == 1 else "first.h5"
+        assert main(command(folder, output, scene, earlier=earlier)) == 0
+        sizes.append(len(load(folder / output).gridded.theta_i))
+    assert sizes == [3, 5]
+
+
+def test_a_dead_wavelength_does_not_hinder_resuming(solved):
+    samples = measured()
+    value = samples.value.copy()
+    value[:, 0], value[:, 8] = np.nan, 0.0
+    samples = dataclasses.replace(samples, value=value)
+    grid = make_grid(samples, GridOptions(22.5, 22.5, 45.0), bilateral=True)
+    whole = everything(grid, 9)
+    some = dataclasses.replace(whole, wavelength=np.isin(np.arange(9), [1, 4, 7]))
+    known = resample(samples, grid, GUIDED, needs=some)
+    found = resample(samples, grid, GUIDED, needs=whole, known=known)
+    assert solved["solved"] == [3, 4] and solved["estimated"] == [1]
+    np.testing.assert_array_equal(np.asarray(found.brdf)[..., [1, 4, 7]], known.brdf)
+    assert np.isnan(np.asarray(found.brdf)[..., 0]).all() and not np.asarray(found.brdf)[..., 8].any()
 
 
 def test_method_paper_takes_over_wavelengths():

@@ -53,7 +53,7 @@ def color_maps(fine: FineGrid, gridded: GriddedBRDF, effect: RingEffect | None) 
     """
     columns = len(fine.incidences)
     stages = (fine.windowed,) if effect is None else (fine.plain, fine.windowed)
-    figure = new_figure(width=2.65 * columns + 0.9, height=3.0 * len(stages) + 0.3)
+    figure = new_figure(width=max(2.65 * columns + 0.9, 7.6), height=3.0 * len(stages) + 0.3)
     panels = figure.subplots(len(stages), columns, squeeze=False)
     for k, incidence in enumerate(fine.incidences):
         # white is the brightest hundredth of the map: the diffuser's white would leave most materials black
