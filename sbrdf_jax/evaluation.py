@@ -6,6 +6,7 @@ A kernel describes one direction; `evaluate` batches it. A new stage, or a metho
 field of its own, registers its kernel for its record with `direction_kernel.register`.
 """
 
+import dataclasses
 import functools
 from typing import Any, cast
 
@@ -28,9 +29,14 @@ from sbrdf_jax.resampling.guided.field import (
     evaluate_with_error,
     field_whitener,
 )
+from sbrdf_jax.resampling.guided.field import evaluate_on_axes as field_on_axes
+from sbrdf_jax.resampling.guided.on_axes import on_axes
 from sbrdf_jax.sinc import Window, azimuth_distance, polar_distance, separable_weights
 
 CHUNK_BYTES = 128 * 2**20  # working memory of one chunk of directions
+NEVER_EVALUATED = (  # of a grid: what `evaluate` does not read
+    "extrapolated", "kkt_residual", "num_steps", "status", "standard_error", "residual_variance", "needed",
+)  # fmt: skip
 MOST_AT_A_TIME = 2048  # directions; more leave the processor's cache
 
 
@@ -248,11 +254,7 @@ def evaluate_in_chunks(
         MOST_AT_A_TIME,
     )
     value = np.empty((count, num_wavelengths))
-    if isinstance(result, LobeTensor):
-        result = pad_ranks(result)
-    if isinstance(result, LobeHarmonics):
-        result = pad_coefficients(result)
-    result = jax.tree.map(jnp.asarray, result)  # to the device once, not with every chunk
+    result = on_device(result)
     for start in range(0, count, size):
         part = [a[start : start + size] for a in flat]
         length = part[0].size
@@ -305,6 +307,18 @@ def evaluate_standard_error(
     return both[0], both[1]
 
 
+def on_device(result: Any) -> Any:
+    """Return the part of a record that evaluation reads, as arrays of JAX and in few shapes; once is enough."""
+    if isinstance(result, LobeTensor):
+        result = pad_ranks(result)
+    if isinstance(result, LobeHarmonics):
+        result = pad_coefficients(result)
+    if isinstance(result, GriddedBRDF):
+        more = {} if result.field is None else {"brdf": None}
+        result = dataclasses.replace(result, **dict.fromkeys(NEVER_EVALUATED), **more)
+    return jax.tree.map(jnp.asarray, result)
+
+
 def evaluate_on_axes(
     result: Any,
     theta_i: npt.ArrayLike,
@@ -315,14 +329,51 @@ def evaluate_on_axes(
     """Evaluate every combination of three axes on the host: [theta_i, theta_o, phi_o, wavelength].
 
     For the grid, eq. (5) is separable: three small products replace one row of weights for
-    every direction. Other records are evaluated direction by direction, in chunks.
+    every direction. A fitted field sums its nodes once for all azimuths. Other records are
+    evaluated direction by direction, in chunks.
     """
+    axes = [np.asarray(a, float) for a in (theta_i, theta_o, phi_o)]
+    shape = tuple(map(len, axes))
     if isinstance(result, GriddedBRDF) and result.field is None:
         wavelength = None if wavelength_nm is None else jnp.asarray(wavelength_nm, float)
-        axes = (jnp.asarray(a, float) for a in (theta_i, theta_o, phi_o))
-        return np.asarray(_grid_on_axes(result, *axes, wavelength))
-    mesh = np.meshgrid(theta_i, theta_o, phi_o, indexing="ij")
-    return evaluate_in_chunks(result, *mesh, wavelength_nm)
+        return np.asarray(_grid_on_axes(on_device(result), *map(jnp.asarray, axes), wavelength))
+    if isinstance(getattr(result, "field", result), GuidedField) and all(shape):
+        value = evaluate_where(result, *axes, np.ones(shape, bool)).reshape(*shape, -1)
+        if wavelength_nm is None:
+            return value
+        wavelength, measured = jnp.atleast_1d(jnp.asarray(wavelength_nm, float)), jnp.asarray(result.wavelength_nm)
+        value = value @ np.asarray(spectral_weights(wavelength, measured)).T
+        return np.where(np.asarray(outside_range(wavelength, measured)), np.nan, value)
+    return evaluate_in_chunks(result, *np.meshgrid(*axes, indexing="ij"), wavelength_nm)
+
+
+def evaluate_where(
+    result: Any,
+    theta_i: Float[np.ndarray, " i"],
+    theta_o: Float[np.ndarray, " o"],
+    phi_o: Float[np.ndarray, " p"],
+    where: Bool[np.ndarray, "i o p"],
+    *,
+    chunk_size: int | None = None,
+) -> Float[np.ndarray, "direction wavelength"]:
+    """Evaluate those combinations of three axes where a mask is true, on the host, in the mask's order.
+
+    As `evaluate_on_axes` where a record gains by it; what is around the mask is then evaluated too.
+    """
+    result, field = on_device(result), getattr(result, "field", result)
+    axes = [np.asarray(a, float) for a in (theta_i, theta_o, phi_o)]
+    if isinstance(result, GriddedBRDF) and field is None:
+        return evaluate_on_axes(result, *axes)[where]
+    if not isinstance(field, GuidedField) or not where.any():
+        directions = (mesh[where] for mesh in np.meshgrid(*axes, indexing="ij"))
+        return evaluate_in_chunks(result, *directions, chunk_size=chunk_size)
+    nodes = None if getattr(result, "interpolate_theta_i", True) else np.asarray(result.theta_i)
+    field, value = getattr(result, "field", result), []
+    for i in np.flatnonzero(where.any(axis=(1, 2))):
+        angle = axes[0][i] if nodes is None else nodes[np.argmin(np.abs(axes[0][i] - nodes))]
+        row = functools.partial(field_on_axes, field, angle)
+        value += on_axes(lambda *at, row=row: (row(*at),), *axes[1:], where[i])
+    return np.concatenate(value)
 
 
 @jax.jit

@@ -6,6 +6,7 @@ time, so that memory stays that of one slice of the grid.
 
 import dataclasses
 import functools
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from jaxtyping import Bool, Float
 from sbrdf_jax import colour
 from sbrdf_jax.angles import angle_between, fold_azimuth
 from sbrdf_jax.encoding import decode
-from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_on_axes, measured_wavelengths
+from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_where, measured_wavelengths
 from sbrdf_jax.grid import midpoints
 from sbrdf_jax.needs import restrict_theta_i
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, SpectralBasis, SpectralField
@@ -25,6 +26,7 @@ from sbrdf_jax.representation.paper import compact_coefficient
 from sbrdf_jax.representation.target import PAPER_DIRECTIONS
 
 NUM_RANDOM_DIRECTIONS, RANDOM_PER_THETA_I = 4096, 512
+MOST_NUMBERS = 1 << 23  # of the incident angles that are evaluated together
 CHUNK_SIZE = 1024  # one shape for all compact evaluations here: they compile once
 ALBEDO_THETA, ALBEDO_PHI = 48, 96  # fewest quadrature points; two a node on finer grids
 
@@ -139,11 +141,10 @@ def error_at_nodes(
     live, needed = live_wavelengths(gridded), needed_nodes(gridded)
     counts = needed.any(axis=(1, 2))
     error_energy, energy, deviation, delta_e = [], [], [], []
-    for i, theta_i in enumerate(np.asarray(gridded.theta_i)):
-        if not counts[i]:
-            continue
-        original = np.asarray(gridded.brdf[i])[needed[i]][:, live]
-        reconstructed = _where(compact, theta_i, gridded.theta_o, gridded.phi_o, needed[i])
+    axes = np.asarray(gridded.theta_i)[counts], gridded.theta_o, gridded.phi_o
+    nodes = zip(np.asarray(gridded.brdf)[counts], needed[counts], strict=True)
+    for (brdf, mask), reconstructed in zip(nodes, slices(compact, *axes, needed[counts]), strict=True):
+        original = brdf[mask][:, live]
         error_energy.append(((reconstructed - original) ** 2).sum())
         energy.append((original**2).sum())
         deviation.append(relative_deviation(reconstructed, original).ravel())
@@ -196,18 +197,18 @@ def error_between(compact: CompactBRDF | LobeHarmonics | LobeTensor, gridded: Gr
     theta_o, phi_o = midpoints(gridded.theta_o), midpoints(gridded.phi_o)
     live, cell = live_wavelengths(gridded), cells_between(needed_nodes(gridded))
 
-    def at(incidence, cells):
-        if not cells.any():
-            return np.nan
-        original = _where(gridded, incidence, theta_o, phi_o, cells)[..., live]
-        reconstructed = _where(compact, incidence, theta_o, phi_o, cells)
-        return relative_error(((reconstructed - original) ** 2).sum(), (original**2).sum())
+    def at(theta_i, cells):
+        errors = np.full(len(cells), np.nan)
+        axes, some = (theta_i[cells.any(axis=(1, 2))], theta_o, phi_o), cells[cells.any(axis=(1, 2))]
+        pairs = zip(slices(gridded, *axes, some), slices(compact, *axes, some), strict=True)
+        sums = [(((got - want[:, live]) ** 2).sum(), (want[:, live] ** 2).sum()) for want, got in pairs]
+        errors[cells.any(axis=(1, 2))] = [relative_error(*pair) for pair in sums]
+        return errors
 
-    midway = midpoints(theta_i)
     both = cell[:-1] & cell[1:] if gridded.interpolate_theta_i else np.zeros_like(cell[:-1])
     return {
-        "relative_error_between": np.array([at(t, cells) for t, cells in zip(theta_i, cell, strict=True)]),
-        "relative_error_between_theta_i": np.array([at(t, cells) for t, cells in zip(midway, both, strict=True)]),
+        "relative_error_between": at(theta_i, cell),
+        "relative_error_between_theta_i": at(midpoints(theta_i), both),
     }
 
 
@@ -355,8 +356,11 @@ def albedo(result, whole: Bool[np.ndarray, " theta_i"] | None = None) -> Float[n
     phi_o = (np.arange(num_phi) + 0.5) * (2 * np.pi / num_phi)
     nodes = np.asarray(result.theta_i)
     rows = np.full((len(nodes), np.size(measured_wavelengths(result))), np.nan)
-    for i in np.arange(len(nodes)) if whole is None else np.flatnonzero(whole):
-        rows[i] = weight @ on_axes(result, nodes[i], theta_o, phi_o).sum(axis=1)
+    whole = np.ones(len(nodes), bool) if whole is None else whole
+    every = np.ones((whole.sum(), num_theta, num_phi), bool)
+    values = slices(result, nodes[whole], theta_o, phi_o, every)
+    for i, value in zip(np.flatnonzero(whole), values, strict=True):
+        rows[i] = weight @ value.reshape(num_theta, num_phi, -1).sum(axis=1)
     return rows * (2 * np.pi / num_phi)
 
 
@@ -375,26 +379,29 @@ def albedo_warnings(albedo: np.ndarray, result, stage: str) -> list[str]:
 
 
 def on_axes(result, theta_i: float, theta_o, phi_o) -> Float[np.ndarray, "theta_o phi_o wavelength"]:
-    """Evaluate one incident angle at every combination of theta_o and phi_o [rad]; mirror twins once."""
-    phi_o = np.asarray(phi_o)
+    """Evaluate one incident angle at every combination of theta_o and phi_o [rad]."""
+    every = np.ones((1, np.size(theta_o), np.size(phi_o)), bool)
+    return next(slices(result, [theta_i], theta_o, phi_o, every)).reshape(*every.shape[1:], -1)
+
+
+def slices(
+    result, theta_i, theta_o, phi_o, where: Bool[np.ndarray, "theta_i theta_o phi_o"]
+) -> Iterator[Float[np.ndarray, "direction wavelength"]]:
+    """Evaluate where a mask over three axes [rad] is true, incident angle by incident angle; mirror twins once."""
+    theta_i, theta_o, phi_o = (np.asarray(a) for a in (theta_i, theta_o, phi_o))
     back = np.arange(len(phi_o))
     if _is_symmetric(result):
         _, first, back = np.unique(np.round(fold_azimuth(phi_o), 12), return_index=True, return_inverse=True)
         phi_o, back = phi_o[first], back.reshape(-1)
-    if isinstance(result, GriddedBRDF):
-        return evaluate_on_axes(result, np.array([theta_i]), np.asarray(theta_o), phi_o)[0][:, back]
-    mesh = np.meshgrid(np.asarray(theta_o), phi_o, indexing="ij")
-    return evaluate_in_chunks(result, np.full(mesh[0].shape, theta_i), *mesh, chunk_size=CHUNK_SIZE)[:, back]
-
-
-def _where(result, theta_i: float, theta_o, phi_o, needed: Bool[np.ndarray, "theta_o phi_o"]) -> np.ndarray:
-    """Evaluate one incident angle where a mask of theta_o and phi_o [rad] is true: [direction, wavelength]."""
-    if needed.all():
-        value = on_axes(result, theta_i, theta_o, phi_o)
-        return value.reshape(-1, value.shape[-1])
-    mesh = np.meshgrid(np.asarray(theta_o), np.asarray(phi_o), indexing="ij")
-    angles = (axis[needed] for axis in mesh)
-    return evaluate_in_chunks(result, np.full(int(needed.sum()), theta_i), *angles, chunk_size=CHUNK_SIZE)
+    distinct = np.stack([where[..., back == k].any(axis=-1) for k in range(len(phi_o))], axis=-1)
+    num_wavelengths = np.size(measured_wavelengths(result))
+    step = max(1, MOST_NUMBERS // (len(theta_o) * len(phi_o) * num_wavelengths))
+    for start in range(0, len(theta_i), step):
+        part = distinct[start : start + step]
+        value = np.empty((*part.shape, num_wavelengths))
+        value[part] = evaluate_where(result, theta_i[start : start + step], theta_o, phi_o, part, chunk_size=CHUNK_SIZE)
+        for each, mask in zip(value, where[start : start + step], strict=True):
+            yield each[:, back][mask]
 
 
 def _is_symmetric(result) -> bool:

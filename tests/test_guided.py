@@ -10,7 +10,13 @@ import pytest
 import scipy.optimize
 
 from sbrdf_jax.cli import main
-from sbrdf_jax.evaluation import evaluate, evaluate_in_chunks, evaluate_standard_error
+from sbrdf_jax.evaluation import (
+    evaluate,
+    evaluate_in_chunks,
+    evaluate_on_axes,
+    evaluate_standard_error,
+    evaluate_where,
+)
 from sbrdf_jax.folds import Folds, read_fold_file
 from sbrdf_jax.formats import read, write_samples
 from sbrdf_jax.grid import make_grid
@@ -21,8 +27,21 @@ from sbrdf_jax.report import draw_figures
 from sbrdf_jax.resampling.guided import describe_fit, fit_field, resample_guided
 from sbrdf_jax.resampling.guided.bounds import solve_bounded
 from sbrdf_jax.resampling.guided.centres import place_centres
-from sbrdf_jax.resampling.guided.coordinates import exchanged, from_log, guided_coordinates, log_scale, to_log
-from sbrdf_jax.resampling.guided.covariance import covariance, node_values, prior_variance
+from sbrdf_jax.resampling.guided.coordinates import (
+    coordinates_on_axes,
+    exchanged,
+    from_log,
+    guided_coordinates,
+    log_scale,
+    to_log,
+)
+from sbrdf_jax.resampling.guided.covariance import (
+    covariance,
+    covariance_on_axes,
+    flatten,
+    node_values,
+    prior_variance,
+)
 from sbrdf_jax.resampling.guided.error_model import MAX_FACTOR, estimate_floor, noise_factors
 from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out, lower_inverse, mirror_lower
 from sbrdf_jax.resampling.guided.lobe_fit import fit_lobe_model
@@ -145,6 +164,14 @@ def test_covariance_and_nodes_equal_dense_matrices(rng, reciprocal):
     found = np.asarray(covariance(variance, at, centres.features))
     np.testing.assert_allclose(found[:, seen], expected, rtol=1e-10)
     np.testing.assert_allclose(prior_variance(variance, at), own, rtol=1e-10)
+    theta_o, phi_o = jnp.asarray([0.0, 0.4, 1.2]), jnp.asarray([0.0, 1.0, np.pi])
+    limit, centre = jnp.asarray(centres.theta_limit), jnp.asarray(centres.angles.reshape(3, 3, -1))
+    along, along_prior = covariance_on_axes(variance, centre, limit, 0.3, theta_o, phi_o)
+    mesh = coordinates_on_axes(jnp.asarray(0.3), theta_o, phi_o, limit)
+    np.testing.assert_allclose(
+        along.reshape(9, -1), covariance(variance, flatten(mesh), centres.features), rtol=1e-10, atol=1e-14
+    )
+    np.testing.assert_allclose(along_prior.reshape(-1), prior_variance(variance, flatten(mesh)), rtol=1e-10)
     dual = np.zeros((centres.count, 2))
     dual[seen] = rng.normal(size=(len(seen), 2))
     nodes = node_values(variance, centres.features, jnp.asarray(dual))
@@ -237,6 +264,20 @@ def test_field_is_finite_non_negative_and_even(field, rng):
     assert (value >= 0).all() and np.isfinite(value).all()
     assert (error >= 0).all() and np.isfinite(error).all() and (noise > 0).all()
     np.testing.assert_allclose(evaluate_in_chunks(field, theta_i, theta_o, -phi), value, rtol=1e-9)
+
+
+def test_values_along_axes_are_those_of_the_directions(field):
+    """Polar angles summed once for all azimuths, in blocks, equal eq. (5) direction by direction."""
+    axes = np.array([0.0, 0.5, 1.5]), np.linspace(0, np.pi / 2, 19), np.linspace(-1, 7, 5)
+    mesh = np.meshgrid(*axes, indexing="ij")
+    wavelength_nm = np.array([390.0, 500.0, 525.0])
+    expected = evaluate_in_chunks(field, *mesh, wavelength_nm)
+    np.testing.assert_allclose(evaluate_on_axes(field, *axes, wavelength_nm), expected, rtol=1e-9, atol=1e-13)
+    where = np.zeros(mesh[0].shape, bool)
+    where[0, 4, 1] = where[2, 2, 3] = where[2, 18, 0] = True
+    found = evaluate_where(field, *axes, where)
+    np.testing.assert_allclose(found, evaluate_in_chunks(field, *(a[where] for a in mesh)), rtol=1e-9, atol=1e-13)
+    assert evaluate_where(field, *axes, np.zeros_like(where)).shape == (0, np.size(field.wavelength_nm))
 
 
 def test_field_is_near_the_truth_and_errors_are_calibrated(field, rng):

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import distance_transform_edt
 
-from sbrdf_jax.evaluation import evaluate_in_chunks
+from sbrdf_jax.evaluation import evaluate_where
 from sbrdf_jax.grid import has_data, midpoints
 from sbrdf_jax.records import GriddedBRDF, SpectralField
 
@@ -110,10 +110,8 @@ def cells_between(needed: Bool[np.ndarray, "i o p"]) -> Bool[np.ndarray, "i o-1 
 
 def _evaluate_needed(gridded: GriddedBRDF, theta_i, theta_o, phi_o, needed: Bool[np.ndarray, "i o p"]) -> np.ndarray:
     """Evaluate those combinations of three axes that are needed; 0 elsewhere."""
-    angles = [mesh[needed] for mesh in np.meshgrid(theta_i, theta_o, phi_o, indexing="ij")]
     value = np.zeros((*needed.shape, np.size(gridded.wavelength_nm)))
-    if needed.any():
-        value[needed] = evaluate_in_chunks(gridded, *angles)
+    value[needed] = evaluate_where(gridded, theta_i, theta_o, phi_o, needed)
     return value
 
 

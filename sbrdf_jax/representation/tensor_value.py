@@ -17,10 +17,12 @@ RANK_STEP = 8
 
 def pad_ranks(tensor: LobeTensor) -> LobeTensor:
     """Return the same tensor with zeros up to ranks of a multiple of 8, so that most tensors share compiled code."""
-    core = np.asarray(tensor.core)
-    more = [-rank % RANK_STEP for rank in core.shape]
+    more = [-rank % RANK_STEP for rank in tensor.core.shape]
     if tensor.basis.kind != "data":
         more[3] = 0  # the config fixes how many
+    if not any(more):
+        return tensor
+    core = np.asarray(tensor.core)
     names = ("theta_i_factor", "theta_o_factor", "direction_factor")
     factors = {name: np.pad(getattr(tensor, name), ((0, 0), (0, n))) for name, n in zip(names, more, strict=False)}
     basis = dataclasses.replace(

@@ -73,6 +73,12 @@ def guided_coordinates(
     )
 
 
+def coordinates_on_axes(theta_i: Float[Array, ""], theta_o: Float[Array, " o"], phi_o: Float[Array, " p"], theta_limit):
+    """`guided_coordinates` [o, p] of all combinations of two axes, at one incident angle."""
+    theta_o, phi_o = jnp.meshgrid(theta_o, phi_o, indexing="ij")
+    return guided_coordinates(jnp.broadcast_to(theta_i, theta_o.shape), theta_o, phi_o, theta_limit)
+
+
 def exchanged(at: Coordinates) -> Coordinates:
     """Return the coordinates of the same light the other way: half angle and azimuth do not change."""
     return dataclasses.replace(at, theta_i=at.theta_o, theta_o=at.theta_i)

@@ -127,16 +127,16 @@ def fit_residual_scale(
 
 def residual_scale(
     scale: ResidualScale,
-    theta_i: Float[Array, " direction"],
-    half: Float[Array, " direction"],
-    z: Float[Array, "direction wavelength"],
-) -> Float[Array, "direction wavelength"]:
+    theta_i: Float[Array, "*direction"],
+    half: Float[Array, "*direction"],
+    z: Float[Array, "*direction wavelength"],
+) -> Float[Array, "*direction wavelength"]:
     """Interpolate the table of `fit_residual_scale`, linearly in its logarithm."""
     shape = scale.log_scale.shape
     ones = jnp.ones_like(z)
     total = jnp.zeros_like(z)
     places = []
-    for axis, feature in enumerate((theta_i[:, None] * ones, half[:, None] * ones, z)):
+    for axis, feature in enumerate((theta_i[..., None] * ones, half[..., None] * ones, z)):
         x = jnp.clip((feature - scale.start[axis]) / scale.step[axis], 0.0, shape[axis] - 1.0)
         low = jnp.clip(jnp.floor(x), 0.0, shape[axis] - 2.0)
         places.append((low.astype(jnp.int32), x - low))

@@ -121,6 +121,13 @@ def cubic_weights(x: Float[Array, "*shape"], axis: Axis) -> tuple[Int[Array, "*s
     return first.astype(jnp.int32), weight
 
 
+def cubic_matrix(x: Float[Array, "*shape"], axis: Axis) -> Float[Array, "*shape node"]:
+    """`cubic_weights` as rows over all nodes, the mirrored ones included; for products with a few rows of nodes."""
+    first, weight = cubic_weights(x, axis)
+    is_node = jax.nn.one_hot(_four(first), axis.count + 2, dtype=weight.dtype)
+    return jnp.sum(is_node * weight[..., None], axis=-2)
+
+
 def _four(first: Int[Array, "*shape"]) -> Int[Array, "*shape 4"]:
     return jnp.stack([first + np.int32(k) for k in range(4)], axis=-1)
 

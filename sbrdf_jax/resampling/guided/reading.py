@@ -3,17 +3,21 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.records import GriddedBRDF
-from sbrdf_jax.resampling.guided.field import GuidedField, posterior_variance, value_and_errors
+from sbrdf_jax.resampling.guided.covariance import covariance_on_axes
+from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_on_axes_with_error, unexplained
 from sbrdf_jax.resampling.guided.lanes import take_field
+from sbrdf_jax.resampling.guided.on_axes import on_axes
 
 SAME_ANGLE = 1e-9  # rad; degrees in a file and back are not exact
-SMALLEST_BATCH, LARGEST_BATCH = 64, 512  # directions evaluated at once, a power of two
+SMALLEST_BATCH, LARGEST_BATCH = 64, 512  # directions whose variance is worked out at once, a power of two
+MOST_PENDING = 4096  # directions whose covariances with all centres are held at a time
 
 
 class NodeValues(NamedTuple):
@@ -34,7 +38,7 @@ def read_nodes(
 ) -> NodeValues:
     """Return the field and its standard error at the grid's nodes.
 
-    The field is even in azimuth, so half of the circle is evaluated, in batches of one shape.
+    The field is even in azimuth, so half of the circle is evaluated, one incident angle at a time.
 
     Args:
         field: The fitted field.
@@ -46,38 +50,71 @@ def read_nodes(
     """
     shape = (len(grid.theta_i), len(grid.theta_o), grid.num_azimuths)
     half = np.ones(shape, bool) if node is None else node[:, :, : grid.num_azimuths]
-    axes = [a.reshape(-1) for a in np.meshgrid(grid.theta_i, grid.theta_o, grid.phi_o[: shape[2]], indexing="ij")]
+    axes = grid.theta_o, grid.phi_o[: shape[2]]
     key = b"".join(np.asarray(a).tobytes() for a in (grid.theta_i, grid.theta_o, grid.phi_o))
-    variance = ({} if variances is None else variances).setdefault(key, np.full(shape, np.nan)).reshape(-1)
+    variance = ({} if variances is None else variances).setdefault(key, np.full(shape, np.nan))
     value = np.full((2, *shape, len(field.wavelength_nm)), np.nan)
     fresh, lanes = half, np.ones(len(field.wavelength_nm), bool)
     if known is not None and known_rows(known, grid) is not None:
-        fresh, lanes = _take_known(value, variance.reshape(shape), half, grid, np.asarray(field.wavelength_nm), known)
-    _add_variances(variance, field, whiten, axes, np.flatnonzero(half.reshape(-1) & np.isnan(variance)))
-    flat = value.reshape(2, -1, value.shape[-1])
+        fresh, lanes = _take_known(value, variance, half, grid, np.asarray(field.wavelength_nm), known)
+    _add_variances(variance, half & np.isnan(variance), field, whiten, grid.theta_i, axes)
     for nodes, columns in ((fresh, np.arange(len(lanes))), (half & ~fresh, np.flatnonzero(lanes))):
-        place = np.flatnonzero(nodes)
-        if len(place) and len(columns):
-            part = field if len(columns) == len(lanes) else take_field(field, columns)
-            inputs = [variance[place], *(a[place] for a in axes)]
-            found = _in_batches(lambda *batch, part=part: value_and_errors(part, *batch)[:2], inputs)
-            flat[:, place[:, None], columns] = found
+        rows = np.flatnonzero(nodes.any(axis=(1, 2)))
+        if not len(columns) or not len(rows):
+            continue
+        part = jax.tree.map(jnp.asarray, field if len(columns) == len(lanes) else take_field(field, columns))
+        for i in rows:
+            found = on_axes(_row(evaluate_on_axes_with_error, part, grid.theta_i[i]), *axes, nodes[i], variance[i])
+            for out, new in zip(value[:, i], found, strict=True):
+                place = np.nonzero(nodes[i])
+                out[place[0][:, None], place[1][:, None], columns] = new
     around, rows = np.append(grid.azimuth_index, 0), half.any(axis=(1, 2))
-    known_variance = np.where(half, variance.reshape(shape), np.nan)[rows][:, :, around]
+    known_variance = np.where(half, variance, np.nan)[rows][:, :, around]
     value = value[:, rows][:, :, :, around]
     return NodeValues(value[0], value[1], known_variance)
 
 
-def _add_variances(variance: np.ndarray, field: GuidedField, whiten: np.ndarray, axes, place: np.ndarray) -> None:
+def _row(function: Callable[..., Any], field: Any, theta_i: float) -> Callable[..., Any]:
+    """Return a function of a field at one incident angle as one of two axes, and of arrays over them."""
+    return lambda theta_o, phi_o, *arrays: function(field, theta_i, theta_o, phi_o, *arrays)
+
+
+def _add_variances(variance: np.ndarray, missing: np.ndarray, field: GuidedField, whiten, theta_i, axes) -> None:
     """Work out the variances that are missing, once for each distinct direction: poles have many azimuths."""
-    if not len(place):
-        return
-    theta_i, theta_o, phi_o = (a[place] for a in axes)
-    phi_o = np.where((theta_i == 0) | (theta_o == 0), 0.0, phi_o)
-    distinct, back = np.unique(np.stack([theta_i, theta_o, phi_o]), axis=1, return_inverse=True)
-    given = (field.variance, *map(jnp.asarray, (field.centre, field.theta_limit, whiten)))
-    found = _in_batches(lambda *batch: (posterior_variance(*given, *batch),), list(distinct))
-    variance[place] = found[0][back.reshape(-1)]
+    prior = (field.variance, *map(jnp.asarray, (field.centre, field.theta_limit)))
+    whiten = jnp.asarray(whiten)
+    pending: list[tuple[np.ndarray, np.ndarray]] = []
+    flushed: list[np.ndarray] = []
+    distinct = missing.copy()
+    isotropic = (theta_i[:, None] == 0) | (axes[0] == 0)
+    distinct[isotropic] = False
+    distinct[..., 0] |= isotropic & missing.any(axis=2)
+    for i in np.flatnonzero(distinct.any(axis=(1, 2))):
+        pending.append(on_axes(lambda *a, i=i: covariance_on_axes(*prior, theta_i[i], *a), *axes, distinct[i]))
+        if sum(len(part[1]) for part in pending) >= MOST_PENDING:
+            flushed.append(_unexplained(pending, whiten))
+            pending = []
+    if pending:
+        flushed.append(_unexplained(pending, whiten))
+    if flushed:
+        found = np.full(variance.shape, np.nan)
+        found[distinct] = np.concatenate(flushed)
+        found[isotropic] = found[isotropic][:, :1]
+        variance[missing] = found[missing]
+
+
+def _unexplained(parts: list[tuple[np.ndarray, np.ndarray]], whiten) -> np.ndarray:
+    """Variances from covariances and prior variances of directions, in batches of few shapes."""
+    cross, prior = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    count = len(prior)
+    size = min(LARGEST_BATCH, max(SMALLEST_BATCH, 1 << (count - 1).bit_length()))
+    found = []
+    for start in range(0, count, size):
+        batch = [a[start : start + size] for a in (cross, prior)]
+        short = size - len(batch[1])
+        batch = [np.concatenate([a, np.repeat(a[-1:], short, axis=0)]) for a in batch] if short else batch
+        found.append(np.asarray(unexplained(*map(jnp.asarray, batch), whiten)))
+    return np.concatenate(found)[:count]
 
 
 def _take_known(value, variance, half: np.ndarray, grid: Grid, wavelength_nm: np.ndarray, known: GriddedBRDF):
@@ -110,12 +147,3 @@ def known_rows(known: GriddedBRDF, grid: Grid) -> np.ndarray | None:
             return None
     distance = np.abs(grid.theta_i[:, None] - np.asarray(known.theta_i))
     return np.where(distance.min(axis=1) <= SAME_ANGLE, distance.argmin(axis=1), -1)
-
-
-def _in_batches(function: Callable[..., Any], inputs: list[np.ndarray]) -> np.ndarray:
-    """Map a function of directions over batches of few shapes; its answers stacked [answer, direction, ...]."""
-    count = len(inputs[0])
-    size = min(LARGEST_BATCH, max(SMALLEST_BATCH, 1 << (count - 1).bit_length()))
-    padded = [np.pad(a, (0, -count % size), mode="edge").reshape(-1, size) for a in inputs]
-    found = [np.asarray(function(*map(jnp.asarray, batch))) for batch in zip(*padded, strict=True)]
-    return np.concatenate(found, axis=1)[:, :count]
