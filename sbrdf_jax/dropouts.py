@@ -80,11 +80,13 @@ def _low(level: np.ndarray, start: np.ndarray, index: np.ndarray) -> np.ndarray:
         return index[start[sample] : start[sample + 1]].tolist()
 
     deep = np.zeros(len(level), bool)
-    for sample in _candidates(level, start, index):
-        basin, overflow = _basin(sample, level, neighbours)
+    candidates = _candidates(level, start, index)
+    basins, overflow = _flood(candidates, level, start, index)
+    far_below = overflow - level[candidates] > np.log(MIN_FACTOR)
+    for sample, members, rim in zip(candidates[far_below], basins[far_below], overflow[far_below], strict=True):
+        basin = set(members[level[members] < rim].tolist())
         around = {k for m in basin for k in neighbours(m)} - basin
-        # at the end of a row of samples, one neighbour proves nothing
-        deep[sample] = overflow - level[sample] > np.log(MIN_FACTOR) and len(around) >= MIN_NEIGHBOURS
+        deep[sample] = len(around) >= MIN_NEIGHBOURS  # at the end of a row of samples, one neighbour proves nothing
     low = deep.copy()
     for edge in {k for m in np.flatnonzero(deep) for k in neighbours(m) if not deep[k]}:
         others = [k for k in neighbours(edge) if not deep[k]]
@@ -93,29 +95,35 @@ def _low(level: np.ndarray, start: np.ndarray, index: np.ndarray) -> np.ndarray:
     return low
 
 
-def _candidates(level: np.ndarray, start: np.ndarray, index: np.ndarray) -> list[int]:
+def _candidates(level: np.ndarray, start: np.ndarray, index: np.ndarray) -> np.ndarray:
     """Samples that may be deep: one neighbour is far above, or a basin may hold them all."""
     count = np.diff(start)
     far_above = np.zeros(len(level), bool)
     some = count > 0
     highest = np.maximum.reduceat(level[index], start[:-1][some])
     far_above[some] = highest - level[some] > np.log(MIN_FACTOR)
-    return np.flatnonzero(far_above | (some & (count <= MAX_TOGETHER))).tolist()
+    return np.flatnonzero(far_above | (some & (count <= MAX_TOGETHER)))
 
 
-def _basin(sample: int, level: np.ndarray, neighbours) -> tuple[set[int], float]:
-    """Return the samples below the level at which the basin of `sample` overflows, and that level.
+def _flood(samples: np.ndarray, level: np.ndarray, start: np.ndarray, index: np.ndarray):
+    """Flood a basin from each sample, always over the lowest sample at its shore, until it holds `MAX_TOGETHER` + 1.
 
-    The basin is flooded from `sample`, always over the lowest sample at its shore, until it
-    holds more than `MAX_TOGETHER`.
+    Returns:
+        Who is flooded [sample, member], and the level at which each basin overflows; -inf where the shore ends first.
     """
-    basin, shore = {sample}, set(neighbours(sample))
-    while shore and len(basin) <= MAX_TOGETHER:
-        lowest = min(shore, key=level.__getitem__)
-        basin.add(lowest)
-        shore = (shore | set(neighbours(lowest))) - basin
-    overflow = float(max(level[k] for k in basin)) if len(basin) > MAX_TOGETHER else -np.inf
-    return {k for k in basin if level[k] < overflow}, overflow
+    nobody, count = len(level), np.diff(start)
+    table = np.full((nobody + 1, max(count.max(initial=0), 1)), nobody)
+    table[np.repeat(np.arange(nobody), count), np.arange(len(index)) - np.repeat(start[:-1], count)] = index
+    height = np.append(level, np.inf)
+    basin = samples[:, None]
+    for _ in range(MAX_TOGETHER):
+        shore = table[basin].reshape(len(samples), -1)
+        flooded = (shore[:, :, None] == basin[:, None, :]).any(axis=2)
+        lowest = np.where(flooded, np.inf, height[shore]).argmin(axis=1)[:, None]
+        next_one = np.where(np.take_along_axis(flooded, lowest, 1), nobody, np.take_along_axis(shore, lowest, 1))
+        basin = np.concatenate([basin, next_one], axis=1)
+    full = (basin < nobody).all(axis=1)
+    return basin, np.where(full, height[basin].max(axis=1), -np.inf)
 
 
 def _neighbours(theta_o: np.ndarray, phi_o: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -100,10 +100,14 @@ def _start(value: np.ndarray, at: Coordinates, used: np.ndarray) -> Float[np.nda
 
 
 def _residual(problem: _Problem, terms: np.ndarray, log_amplitude: np.ndarray):
-    """Return z of the model minus z, the parts of the value, and d z / d value [wavelength, (term,) sample]."""
-    parts = np.exp(log_amplitude)[:, :, None] * terms.T
-    scaled = parts.sum(axis=1) * problem.scale
-    return np.log1p(scaled) - problem.z, parts, problem.scale / (1 + scaled)
+    """Return z of the model minus z, and d z / d value, both [wavelength, sample]."""
+    scaled = (np.exp(log_amplitude) @ terms.T) * problem.scale
+    return np.log1p(scaled) - problem.z, problem.scale / (1 + scaled)
+
+
+def _robust(problem: _Problem, residual: np.ndarray) -> np.ndarray:
+    """Weights [wavelength, sample] with which least squares has the gradient of the soft-L1 loss."""
+    return problem.weight / np.sqrt(1 + (residual / LOSS_SCALE) ** 2)
 
 
 def _loss(residual: np.ndarray, weight: np.ndarray) -> Float[np.ndarray, " wavelength"]:
@@ -132,16 +136,17 @@ def _fit_shape(problem: _Problem, log_amplitude: np.ndarray) -> Float[np.ndarray
     def loss_of(residual, shape):
         return _loss(residual, weight).sum() + float(pull_of_prior @ (shape - PRIOR) ** 2)
 
-    residual, parts, slope = _residual(problem, terms_of(shape, problem.at, np), log_amplitude)
+    residual, slope = _residual(problem, terms_of(shape, problem.at, np), log_amplitude)
     loss, fresh = loss_of(residual, shape), True
     for _ in range(SHAPE_STEPS):
         if fresh:
-            robust = weight / np.sqrt(1 + (residual / LOSS_SCALE) ** 2)
+            parts = np.exp(log_amplitude)[:, :, None] * terms_of(shape, problem.at, np).T
             steps = DIFFERENCE * np.eye(len(shape))
             change = [terms_of(shape + h, problem.at, np) - terms_of(shape - h, problem.at, np) for h in steps]
             by_shape = np.stack(change) / (2 * DIFFERENCE)  # [shape, sample, term]
             shared = np.einsum("snt,mt->msn", by_shape, np.exp(log_amplitude)) * slope[:, None, :]
-            whole, pull = _normal(np.concatenate([parts * slope[:, None, :], shared], axis=1), robust, residual)
+            jacobian = np.concatenate([parts * slope[:, None, :], shared], axis=1)
+            whole, pull = _normal(jacobian, _robust(problem, residual), residual)
             corner = whole[:, NUM_TERMS:, NUM_TERMS:].sum(axis=0) + np.diag(pull_of_prior)
             shape_pull = pull[:, NUM_TERMS:].sum(axis=0) + pull_of_prior * (shape - PRIOR)
         block = _damped(whole[:, :NUM_TERMS, :NUM_TERMS], np.full(len(log_amplitude), damping))
@@ -162,7 +167,7 @@ def _fit_shape(problem: _Problem, log_amplitude: np.ndarray) -> Float[np.ndarray
             continue
         converged = loss - new_loss < STOP * loss
         shape, log_amplitude, loss = new_shape, new_amplitude, new_loss
-        residual, parts, slope = found
+        residual, slope = found
         damping = max(damping / 5, LEAST_DAMPING)
         if converged:
             break
@@ -170,33 +175,34 @@ def _fit_shape(problem: _Problem, log_amplitude: np.ndarray) -> Float[np.ndarray
 
 
 def _fit_amplitudes(problem: _Problem, terms: np.ndarray, log_amplitude: np.ndarray):
-    """Fit every wavelength's amplitudes to a shape; return them, and the relative norm of each gradient."""
-    weight, answer = problem.weight, log_amplitude.copy()
+    """Fit every wavelength's amplitudes to a shape; return them, and the relative norm of each gradient.
+
+    The Jacobian is amplitude x term x slope: its products are those of the terms, whatever the wavelength.
+    """
+    answer, products = log_amplitude.copy(), (terms[:, :, None] * terms[:, None, :]).reshape(len(terms), -1)
     lanes, damping = np.arange(len(answer)), np.full(len(answer), 1e-2)
-    residual, parts, slope = _residual(problem, terms, answer)
-    loss = _loss(residual, weight)
+    residual, slope = _residual(problem, terms, answer)
+    loss = _loss(residual, problem.weight)
     for _ in range(AMPLITUDE_STEPS):
-        robust = weight / np.sqrt(1 + (residual / LOSS_SCALE) ** 2)
-        block, pull = _normal(parts * slope[:, None, :], robust, residual)
+        amplitude, weighted = np.exp(answer[lanes]), _robust(problem, residual) * slope
+        block = ((weighted * slope) @ products).reshape(-1, NUM_TERMS, NUM_TERMS)
+        block *= amplitude[:, :, None] * amplitude[:, None, :]
+        pull = amplitude * ((weighted * residual) @ terms)
         step = -np.linalg.solve(_damped(block, damping), pull[:, :, None])[:, :, 0]
         trial = problem.clip(answer[lanes] + np.clip(step, -LARGEST_CHANGE, LARGEST_CHANGE))
         found = _residual(problem._replace(z=problem.z[lanes]), terms, trial)
-        new_loss = _loss(found[0], weight)
+        new_loss = _loss(found[0], problem.weight)
         better = new_loss < loss
         answer[lanes[better]] = trial[better]
         converged = better & (loss - new_loss < AMPLITUDE_STOP * loss)
         damping = np.where(better, np.maximum(damping / 5, LEAST_DAMPING), damping * 5)
         go_on = ~converged & (damping <= MOST_DAMPING)
-        chosen = (
-            np.where(better[(...,) + (None,) * (a.ndim - 1)], a, b)
-            for a, b in zip(found, (residual, parts, slope), strict=True)
-        )
-        residual, parts, slope = (a[go_on] for a in chosen)
+        chosen = (np.where(better[:, None], a, b) for a, b in zip(found, (residual, slope), strict=True))
+        residual, slope = (a[go_on] for a in chosen)
         loss, lanes, damping = np.where(better, new_loss, loss)[go_on], lanes[go_on], damping[go_on]
         if not len(lanes):
             break
-    residual, parts, slope = _residual(problem, terms, answer)
-    pull = weight * residual / np.sqrt(1 + (residual / LOSS_SCALE) ** 2)
-    jacobian = parts * slope[:, None, :]
-    gradient, size = (np.linalg.norm((jacobian @ p[:, :, None])[:, :, 0], axis=1) for p in (pull, np.abs(pull)))
+    residual, slope = _residual(problem, terms, answer)
+    pull = _robust(problem, residual) * residual * slope
+    gradient, size = (np.linalg.norm(np.exp(answer) * (p @ terms), axis=1) for p in (pull, np.abs(pull)))
     return answer, gradient / np.maximum(size, 1e-300)

@@ -6,17 +6,18 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg.blas
 from jaxtyping import Float
 
 from sbrdf_jax.grid import Grid
+from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.records import GriddedBRDF
 from sbrdf_jax.resampling.guided.covariance import covariance_on_axes
-from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_on_axes_with_error, unexplained
+from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_on_axes_with_error
 from sbrdf_jax.resampling.guided.lanes import take_field
 from sbrdf_jax.resampling.guided.on_axes import on_axes
 
 SAME_ANGLE = 1e-9  # rad; degrees in a file and back are not exact
-SMALLEST_BATCH, LARGEST_BATCH = 64, 512  # directions whose variance is worked out at once, a power of two
 MOST_PENDING = 4096  # directions whose covariances with all centres are held at a time
 
 
@@ -82,7 +83,6 @@ def _row(function: Callable[..., Any], field: Any, theta_i: float) -> Callable[.
 def _add_variances(variance: np.ndarray, missing: np.ndarray, field: GuidedField, whiten, theta_i, axes) -> None:
     """Work out the variances that are missing, once for each distinct direction: poles have many azimuths."""
     prior = (field.variance, *map(jnp.asarray, (field.centre, field.theta_limit)))
-    whiten = jnp.asarray(whiten)
     pending: list[tuple[np.ndarray, np.ndarray]] = []
     flushed: list[np.ndarray] = []
     distinct = missing.copy()
@@ -103,18 +103,12 @@ def _add_variances(variance: np.ndarray, missing: np.ndarray, field: GuidedField
         variance[missing] = found[missing]
 
 
-def _unexplained(parts: list[tuple[np.ndarray, np.ndarray]], whiten) -> np.ndarray:
-    """Variances from covariances and prior variances of directions, in batches of few shapes."""
+def _unexplained(parts: list[tuple[np.ndarray, np.ndarray]], whiten: np.ndarray) -> np.ndarray:
+    """`field.unexplained` of covariances and prior variances, on the host: BLAS multiplies by a triangle as such."""
     cross, prior = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    count = len(prior)
-    size = min(LARGEST_BATCH, max(SMALLEST_BATCH, 1 << (count - 1).bit_length()))
-    found = []
-    for start in range(0, count, size):
-        batch = [a[start : start + size] for a in (cross, prior)]
-        short = size - len(batch[1])
-        batch = [np.concatenate([a, np.repeat(a[-1:], short, axis=0)]) for a in batch] if short else batch
-        found.append(np.asarray(unexplained(*map(jnp.asarray, batch), whiten)))
-    return np.concatenate(found)[:count]
+    with one_blas_thread():
+        explained = scipy.linalg.blas.dtrmm(1.0, whiten, cross.T, lower=1, overwrite_b=1)
+    return np.maximum(prior - np.einsum("cd,cd->d", explained, explained), 0.0)
 
 
 def _take_known(value, variance, half: np.ndarray, grid: Grid, wavelength_nm: np.ndarray, known: GriddedBRDF):
