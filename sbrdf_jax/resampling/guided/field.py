@@ -26,6 +26,8 @@ from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, interpolate
 DIRECTIONS_AT_A_TIME = 1024
 MOST_GATHERED = 8  # wavelengths; measured: 1.8 us a direction against 6.1 for 1, 5.0 and 7.4 for 6, 46 and 16 for 31
 
+LAST_AXIS = ("wavelength_nm", "half", "azimuth", "multiplier", "model_residual")  # is the wavelength's, in a field
+
 
 @pytree()
 class MeasuredLobe:
