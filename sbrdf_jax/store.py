@@ -204,9 +204,11 @@ def load_stage(
         if wavelength_nm is not None:
             wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, float))
             measured_nm = read(group, "wavelength_nm")
-            for wrong in wavelength_nm[outside_range(wavelength_nm, measured_nm)]:
+            wrong = wavelength_nm[outside_range(wavelength_nm, measured_nm)]
+            if wrong.size or not wavelength_nm.size:
+                shown = f"{wrong[0]:g}" if wrong.size else "none"
                 expected = f"expected {measured_nm[0]:g} to {measured_nm[-1]:g} nm, as measured"
-                raise UserError(f"{path}: wavelength: found {wrong:g}, {expected}")
+                raise UserError(f"{path}: wavelength: found {shown}, {expected}")
         return read_compact(group) if stage == "compact" else read_query(group, _field_of(file), wavelength_nm)
 
 
