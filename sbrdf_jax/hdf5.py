@@ -9,7 +9,6 @@ from typing import Any
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
 from sbrdf_jax.errors import UserError
 
@@ -97,9 +96,7 @@ def write_mapping(group: h5py.Group, mapping: Mapping[str, Any], units: str) -> 
             group.attrs[name] = json.dumps(value)
 
 
-def write_array(
-    group: h5py.Group, name: str, value: npt.ArrayLike, units: str, *, chunks: tuple[int, ...] | None = None
-) -> None:
+def write_array(group: h5py.Group, name: str, value, units: str, *, chunks: tuple[int, ...] | None = None) -> None:
     """Write an array whose axes are numbered alone; `chunks` as for `dataset`."""
     value = np.asarray(value)
     axes = [scale(group, f"{name}_axis{k}", np.arange(n), "1") for k, n in enumerate(value.shape)]

@@ -184,8 +184,8 @@ def load_stage(
     Args:
         path: A result of `run`.
         stage: "grid" or "compact".
-        wavelength_nm: Where the record will be evaluated [nm], scalar or [query], in the measured range; the
-            measured wavelengths unless given.
+        wavelength_nm: Where the record will be evaluated [nm], [query], in the measured range; the measured wavelengths
+            unless given.
 
     Returns:
         The record. That of the grid holds only the measured wavelengths [nm] around those asked for, up to two on
