@@ -1,9 +1,9 @@
 """The result file: HDF5 names, units, scales and schema version; write and read.
 
 Angles are stored in degrees, wavelengths in nm, BRDF values in 1/sr. Every dataset has a
-`units` attribute and a dimension scale on each axis; big ones are chunked by theta_i or, where
-evaluation reads them, by wavelength. The
-group `compact` alone is enough to evaluate the compact form.
+`units` attribute and a dimension scale on each axis; big ones are chunked by theta_i, and by
+wavelength where a query reads few of them. The group `compact` alone is enough to evaluate the
+compact form.
 """
 
 import dataclasses
