@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from sbrdf_jax.resampling import resample as resample
     from sbrdf_jax.store import RunResult as RunResult
     from sbrdf_jax.store import load as load
+    from sbrdf_jax.store import load_stage as load_stage
     from sbrdf_jax.store import save as save
 
 _HOME = {
@@ -55,7 +56,7 @@ _HOME = {
     "records": ("CompactBRDF", "GriddedBRDF", "LobeHarmonics", "LobeTensor", "RawSamples", "SpectralField", "Status"),
     "representation": ("represent",),
     "resampling": ("resample",),
-    "store": ("RunResult", "load", "save"),
+    "store": ("RunResult", "load", "load_stage", "save"),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 __all__ = sorted(_MODULE_OF)

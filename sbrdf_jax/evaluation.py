@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, Real
+from jaxtyping import Array, ArrayLike, Float, Int, Real
 
 from sbrdf_jax.encoding import decode
-from sbrdf_jax.interpolation import spectral_weights
+from sbrdf_jax.interpolation import outside_range, spectral_weights
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, SpectralField
 from sbrdf_jax.representation.lobe_harmonics_value import lobe_harmonics_value, pad_coefficients
 from sbrdf_jax.representation.paper import compact_coefficient
@@ -152,14 +152,6 @@ def _(result: LobeHarmonics, theta_i, theta_o, phi_o, *, wavelength_nm=None):
 def measured_wavelengths(result) -> Float[Array | np.ndarray, " wavelength"]:
     """The measured wavelengths [nm] of a record: its own, or those of its spectral basis."""
     return result.wavelength_nm if hasattr(result, "wavelength_nm") else result.basis.wavelength_nm
-
-
-def outside_range(
-    wavelength_nm: Float[Array, " query"], measured_nm: Float[Array, " wavelength"]
-) -> Bool[Array, " query"]:
-    """True where a wavelength lies outside the measured range, but for rounding."""
-    slack = 1e-9 * measured_nm[-1]
-    return (wavelength_nm < measured_nm[0] - slack) | (wavelength_nm > measured_nm[-1] + slack)
 
 
 def nearest(angle: Float[Array, ""], nodes: Float[Array, " node"]) -> Int[Array, ""]:

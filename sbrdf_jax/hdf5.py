@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,17 +45,26 @@ def degrees(angle) -> np.ndarray:
     return np.where(np.isclose(exact, short, rtol=4e-16, atol=1e-15), short, exact)
 
 
-def dataset(group: h5py.Group, name: str, value, units: str, axes: list[h5py.Dataset]) -> h5py.Dataset:
-    """Write one dataset with units and a dimension scale on each axis; chunked by its first axis where it has more.
+def dataset(
+    group: h5py.Group,
+    name: str,
+    value,
+    units: str,
+    axes: list[h5py.Dataset],
+    *,
+    chunks: tuple[int, ...] | None = None,
+) -> h5py.Dataset:
+    """Write one dataset with units and a dimension scale on each axis.
 
-    A checksum covers every one, whatever its size: a flipped bit is an error, never another number.
+    Where it has more than one axis, its chunks have the shape `chunks`, or unless given that of an entry of the first
+    axis. A checksum covers every one, whatever its size: a flipped bit is an error, never another number.
     """
     value = np.asarray(value)
     if value.dtype.kind == "f":
         value = value.astype(np.float64)
     options: dict[str, Any] = {"track_times": False}  # equal input, equal bytes
     if value.ndim >= CHUNKED_FROM and value.size:
-        options |= {"chunks": (1, *value.shape[1:]), "fletcher32": True}
+        options |= {"chunks": chunks or (1, *value.shape[1:]), "fletcher32": True}
     elif value.nbytes <= LARGEST_COMPACT:
         options["dcpl"] = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         options["dcpl"].set_layout(h5py.h5d.COMPACT)
@@ -82,11 +91,16 @@ def write_mapping(group: h5py.Group, mapping: Mapping[str, Any], units: str) -> 
         if isinstance(value, Mapping):
             write_mapping(group.create_group(name), value, units)
         elif isinstance(value, (np.ndarray, np.generic, int, float)) and np.asarray(value).dtype.kind in "biuf":
-            value = np.asarray(value)
-            axes = [scale(group, f"{name}_axis{k}", np.arange(n), "1") for k, n in enumerate(value.shape)]
-            dataset(group, name, value, units, axes)
+            write_array(group, name, value, units)
         else:
             group.attrs[name] = json.dumps(value)
+
+
+def write_array(group: h5py.Group, name: str, value, units: str, *, chunks: tuple[int, ...] | None = None) -> None:
+    """Write an array whose axes are numbered alone; `chunks` as for `dataset`."""
+    value = np.asarray(value)
+    axes = [scale(group, f"{name}_axis{k}", np.arange(n), "1") for k, n in enumerate(value.shape)]
+    dataset(group, name, value, units, axes, chunks=chunks)
 
 
 def group_of(group: h5py.Group, name: str) -> h5py.Group:
@@ -111,8 +125,16 @@ def attribute(item: h5py.Group | h5py.Dataset, name: str) -> Any:
     return item.attrs[name]
 
 
-def read(group: h5py.Group, name: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
+def read(
+    group: h5py.Group, name: str, shape: tuple[int, ...] | None = None, *, last: np.ndarray | slice | None = None
+) -> np.ndarray:
     """Read one numeric dataset after a look at its kind, shape and size.
+
+    Args:
+        group: The group above it.
+        name: Its name there.
+        shape: What the whole dataset must have.
+        last: Which entries of the last axis to read, increasing; no chunk without one of them is read.
 
     Raises:
         ValueError: it is no array of numbers, has another shape than its axes, or declares far more than it holds.
@@ -124,7 +146,16 @@ def read(group: h5py.Group, name: str, shape: tuple[int, ...] | None = None) -> 
         raise ValueError(f"{group.name}/{name}: found shape {stored.shape}, expected {shape}")
     if stored.nbytes > MOST_EXPANSION * stored.id.get_storage_size() + 4096:
         raise ValueError(f"{group.name}/{name}: declares {stored.nbytes} bytes, far more than it holds")
-    return np.asarray(stored[()])
+    if isinstance(last, np.ndarray):
+        return _read_entries(stored, last)
+    return np.asarray(stored[()] if last is None else stored[..., last])
+
+
+def _read_entries(stored: h5py.Dataset, last: np.ndarray) -> np.ndarray:
+    """Read entries of the last axis, each chunk once and whole: a selection of many small pieces is slow in HDF5."""
+    length = stored.chunks[-1] if stored.chunks else stored.shape[-1]
+    runs = np.split(last, np.flatnonzero(np.diff(last) > length) + 1)  # no two share a chunk, none spans one in vain
+    return np.concatenate([stored[..., run[0] : run[-1] + 1][..., run - run[0]] for run in runs], axis=-1)
 
 
 def read_datasets(group: h5py.Group) -> dict[str, np.ndarray]:
@@ -139,13 +170,13 @@ def read_datasets(group: h5py.Group) -> dict[str, np.ndarray]:
     return found
 
 
-def read_mapping(group: h5py.Group) -> dict[str, Any]:
-    """Read what `write_mapping` wrote."""
+def read_mapping(group: h5py.Group, without: Collection[str] = ()) -> dict[str, Any]:
+    """Read what `write_mapping` wrote, but for some names."""
     found: dict[str, Any] = {name: json.loads(attribute(group, name)) for name in group.attrs}
     for name, item in group.items():
         if isinstance(item, h5py.Group):
             found[name] = read_mapping(item)
-        elif not item.is_scale:
+        elif name not in without and not item.is_scale:
             value = read(group, name)
             found[name] = value if value.ndim else value[()].item()
     return found

@@ -2,7 +2,8 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 
 @jax.jit
@@ -30,6 +31,28 @@ def spectral_weights(
         + slope_low[:, None] * slope[lower]
         + slope_high[:, None] * slope[lower + 1]
     )
+
+
+def neighbours(
+    wavelength_nm: Float[np.ndarray, " query"], nodes_nm: Float[np.ndarray, " wavelength"]
+) -> Int[np.ndarray, " neighbour"]:
+    """Indices, increasing, of the nodes that `spectral_weights` needs: two on each side, as far as there are.
+
+    At these wavelengths alone the weights of the queries are the same as among all nodes; at
+    other wavelengths they need not be, because the neighbours of two queries are joined.
+    """
+    count = len(nodes_nm)
+    lower = np.clip(np.searchsorted(nodes_nm, wavelength_nm, side="right") - 1, 0, max(count - 2, 0))
+    around = np.unique(lower[:, None] + np.arange(-1, 3))
+    return around[(around >= 0) & (around < count)]
+
+
+def outside_range(
+    wavelength_nm: Float[Array | np.ndarray, " query"], measured_nm: Float[Array | np.ndarray, " wavelength"]
+) -> Bool[Array | np.ndarray, " query"]:
+    """True where a wavelength lies outside the measured range, but for rounding, or is NaN."""
+    slack = 1e-9 * measured_nm[-1]
+    return ~((wavelength_nm >= measured_nm[0] - slack) & (wavelength_nm <= measured_nm[-1] + slack))
 
 
 def slope_matrix(nodes: Float[Array, " node"]) -> Float[Array, "node node"]:

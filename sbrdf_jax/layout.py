@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from collections.abc import Mapping
+from typing import Any
 
 import h5py
 import jax.numpy as jnp
@@ -13,17 +14,31 @@ from sbrdf_jax.colour import ColourMatching
 from sbrdf_jax.compact_layout import read_basis, status_dataset, write_basis
 from sbrdf_jax.coverage import Coverage
 from sbrdf_jax.encoding import coefficient_names
-from sbrdf_jax.hdf5 import attribute, dataset, dataset_of, degrees, read, read_mapping, scale, write_mapping
+from sbrdf_jax.hdf5 import (
+    attribute,
+    dataset,
+    dataset_of,
+    degrees,
+    read,
+    read_mapping,
+    scale,
+    write_array,
+    write_mapping,
+)
+from sbrdf_jax.interpolation import neighbours
 from sbrdf_jax.quadrature import Quadrature
 from sbrdf_jax.records import GriddedBRDF, SpectralField
 from sbrdf_jax.resampling.guided.error_model import ResidualScale
-from sbrdf_jax.resampling.guided.field import GuidedField, MeasuredLobe
+from sbrdf_jax.resampling.guided.field import LAST_AXIS, GuidedField, MeasuredLobe
 from sbrdf_jax.resampling.guided.lobe_model import SHAPE_NAMES, LobeModel
 from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, mirror
 from sbrdf_jax.scores import SCORE_TEXT
 
 GUIDED_PARTS = {"lobe": LobeModel, "variance": ModeVariance, "scale": ResidualScale, "measured": MeasuredLobe}
+WAVELENGTHS_A_CHUNK = 8  # a wavelength between the measured ones needs four
 _ANGLES = ("theta_i", "theta_o", "phi_o")
+_PROOF = ("kkt_residual", "num_steps", "status")
+_EVERY = slice(None)
 
 # Axes and units of what validation stores, by the last part of the name; scores and counts have neither.
 VALIDATION_AXES = {
@@ -44,7 +59,9 @@ def write_grid(group: h5py.Group, gridded: GriddedBRDF) -> None:
     axes = {name: scale(group, f"{name}_deg", degrees(getattr(gridded, name)), "deg") for name in _ANGLES}
     axes["wavelength"] = scale(group, "wavelength_nm", gridded.wavelength_nm, "nm")
     directions = [axes[name] for name in _ANGLES]
-    dataset(group, "brdf", gridded.brdf, "1/sr", [*directions, axes["wavelength"]])
+    some = min(np.shape(gridded.brdf)[-1], WAVELENGTHS_A_CHUNK)
+    chunks = (1, *np.shape(gridded.brdf)[1:-1], some)
+    dataset(group, "brdf", gridded.brdf, "1/sr", [*directions, axes["wavelength"]], chunks=chunks)
     flags = dataset(group, "extrapolated", np.asarray(gridded.extrapolated, np.uint8), "1", directions)
     flags.attrs["names"] = "measured nearby,interpolated,beyond the measured range"
     dataset(group, "kkt_residual", gridded.kkt_residual, "1", [axes["wavelength"]])
@@ -55,7 +72,8 @@ def write_grid(group: h5py.Group, gridded: GriddedBRDF) -> None:
     if gridded.residual_variance is not None:
         dataset(group, "residual_variance", gridded.residual_variance, "1", directions)
     if gridded.standard_error is not None:
-        dataset(group, "standard_error", gridded.standard_error, "1/sr", [*directions, axes["wavelength"]])
+        error = gridded.standard_error
+        dataset(group, "standard_error", error, "1/sr", [*directions, axes["wavelength"]], chunks=chunks)
 
 
 def write_guided(group: h5py.Group, field: GuidedField) -> None:
@@ -67,6 +85,9 @@ def write_guided(group: h5py.Group, field: GuidedField) -> None:
     for name in ("theta_limit", "centre"):
         arrays[f"{name}_deg"] = degrees(arrays.pop(name))
     parts = {name: {f: np.asarray(v) for f, v in vars(record[name]).items()} for name in GUIDED_PARTS}
+    for name in LAST_AXIS:
+        value = arrays.pop(name)
+        write_array(group, name, value, "1", chunks=(*value.shape[:-1], min(value.shape[-1], WAVELENGTHS_A_CHUNK)))
     write_mapping(group, arrays | parts | {"lobe_shape": list(SHAPE_NAMES)}, "1")
     for name, axes in GRIDS.items():
         for axis, label in zip(axes, (name, "theta_i", "theta_o"), strict=True):
@@ -153,9 +174,13 @@ def write_validation(
             written.attrs["meaning"] = SCORE_TEXT[last]
 
 
-def read_guided(group: h5py.Group) -> GuidedField:
-    """Read the guided field."""
-    stored = read_mapping(group)
+def read_guided(group: h5py.Group, lanes: np.ndarray | slice = _EVERY) -> GuidedField:
+    """Read the guided field at some of its wavelengths, by index; no more of the large arrays than their chunks."""
+    stored = read_mapping(group, without=LAST_AXIS)
+    count = len(dataset_of(group, "wavelength_nm"))
+    for name in LAST_AXIS:
+        stored[name] = read(group, name, (*dataset_of(group, name).shape[:-1], count), last=lanes)
+    stored["lobe"]["log_amplitude"] = stored["lobe"]["log_amplitude"][:, lanes]
     parts = {name: kind(**stored.pop(name)) for name, kind in GUIDED_PARTS.items()}
     angles = {name: np.deg2rad(stored.pop(f"{name}_deg")) for name in ("theta_limit", "centre")}
     variance = parts["variance"]
@@ -168,28 +193,47 @@ def read_guided(group: h5py.Group) -> GuidedField:
 
 def read_grid(group: h5py.Group, field: h5py.Group | None = None) -> GriddedBRDF:
     """Read the resampled field, with what evaluates it where that is more than the nodes."""
-    axes = [read(group, f"{name}_deg") for name in _ANGLES]
-    wavelength_nm = read(group, "wavelength_nm")
-    directions, lanes = tuple(map(len, axes)), (len(wavelength_nm),)
+    *directions, lanes = _grid_shape(group)
     return GriddedBRDF(
-        theta_i=np.deg2rad(axes[0]),
-        theta_o=np.deg2rad(axes[1]),
-        phi_o=np.deg2rad(axes[2]),
-        wavelength_nm=wavelength_nm,
-        brdf=read(group, "brdf", (*directions, *lanes)),
-        extrapolated=read(group, "extrapolated", directions),
-        kkt_residual=read(group, "kkt_residual", lanes),
-        num_steps=read(group, "num_steps", lanes),
-        status=read(group, "status", lanes),
-        method=str(attribute(group, "method")),
-        window=str(attribute(group, "window")),
-        bilateral=bool(attribute(group, "bilateral")),
-        interpolate_theta_i=bool(attribute(group, "interpolate_theta_i")),
-        standard_error=read(group, "standard_error", (*directions, *lanes)) if "standard_error" in group else None,
-        residual_variance=read(group, "residual_variance", directions) if "residual_variance" in group else None,
-        needed=read(group, "needed", directions) > 0 if "needed" in group else None,
+        **_read_axes(group),
+        brdf=read(group, "brdf", (*directions, lanes)),
+        extrapolated=read(group, "extrapolated", (*directions,)),
+        standard_error=read(group, "standard_error", (*directions, lanes)) if "standard_error" in group else None,
+        residual_variance=read(group, "residual_variance", (*directions,)) if "residual_variance" in group else None,
+        needed=read(group, "needed", (*directions,)) > 0 if "needed" in group else None,
         field=None if field is None else read_guided(field),
     )
+
+
+def read_query(group: h5py.Group, field: h5py.Group | None, wavelength_nm: np.ndarray | None) -> GriddedBRDF:
+    """Read what evaluates the resampled field at some wavelengths [nm] in the measured range, all unless given.
+
+    The record holds the measured wavelengths around them and their proof. The values at the
+    nodes are None where `field` evaluates it, the flags and errors at the nodes always.
+    """
+    lanes = _EVERY if wavelength_nm is None else neighbours(wavelength_nm, read(group, "wavelength_nm"))
+    return GriddedBRDF(
+        **_read_axes(group, lanes),
+        brdf=read(group, "brdf", _grid_shape(group), last=lanes) if field is None else None,
+        extrapolated=None,
+        field=None if field is None else read_guided(field, lanes),
+    )
+
+
+def _grid_shape(group: h5py.Group) -> tuple[int, ...]:
+    return tuple(len(dataset_of(group, name)) for name in (*(f"{angle}_deg" for angle in _ANGLES), "wavelength_nm"))
+
+
+def _read_axes(group: h5py.Group, lanes: np.ndarray | slice = _EVERY) -> dict[str, Any]:
+    """Read nodes and method of a grid and, at some of its wavelengths, how well each was solved."""
+    wavelength_nm = read(group, "wavelength_nm")
+    return {
+        **{name: np.deg2rad(read(group, f"{name}_deg")) for name in _ANGLES},
+        "wavelength_nm": wavelength_nm[lanes],
+        **{name: read(group, name, wavelength_nm.shape)[lanes] for name in _PROOF},
+        **{name: str(attribute(group, name)) for name in ("method", "window")},
+        **{name: bool(attribute(group, name)) for name in ("bilateral", "interpolate_theta_i")},
+    }
 
 
 def read_field(group: h5py.Group, gridded: GriddedBRDF) -> SpectralField:

@@ -72,7 +72,7 @@ class GriddedBRDF:
     phi_o runs from 0 to 2 pi inclusive. For method "paper" the nodes are the field: any
     direction follows from them by eq. (5), under `window`; for "guided" they are read off
     `field`. `interpolate_theta_i` is False where fewer than 3 incident angles were measured:
-    the theta_i axis is then the measured ones.
+    the theta_i axis is then the measured ones. What `store.load_stage` does not read is None.
     """
 
     theta_i: Any  # [theta_i] rad

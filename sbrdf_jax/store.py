@@ -1,8 +1,9 @@
 """The result file: HDF5 names, units, scales and schema version; write and read.
 
 Angles are stored in degrees, wavelengths in nm, BRDF values in 1/sr. Every dataset has a
-`units` attribute and a dimension scale on each axis; big ones are chunked by theta_i. The
-group `compact` alone is enough to evaluate the compact form.
+`units` attribute and a dimension scale on each axis; big ones are chunked by theta_i, and by
+wavelength where a query reads few of them. The group `compact` alone is enough to evaluate the
+compact form.
 """
 
 import dataclasses
@@ -15,6 +16,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 
 from sbrdf_jax.cleaning import CleanReport
 from sbrdf_jax.compact_layout import read_compact, write_compact
@@ -28,16 +30,19 @@ from sbrdf_jax.hdf5 import (
     file_in_memory,
     group_of,
     one_line_errors,
+    read,
     read_datasets,
     read_mapping,
     scale,
     write_mapping,
 )
+from sbrdf_jax.interpolation import outside_range
 from sbrdf_jax.layout import (
     read_cleaning,
     read_field,
     read_grid,
     read_quadrature,
+    read_query,
     write_cleaning,
     write_field,
     write_grid,
@@ -146,7 +151,7 @@ def load(path: str | os.PathLike) -> RunResult:
     """
     with open_result(path) as file:
         source = group_of(file, "input")
-        gridded = _read_grid(file)
+        gridded = read_grid(group_of(file, "grid"), _field_of(file))
         compact = read_compact(group_of(file, "compact")) if "compact" in file else None
         return RunResult(
             gridded=gridded,
@@ -168,20 +173,47 @@ def load(path: str | os.PathLike) -> RunResult:
 
 
 @one_line_errors
-def load_stage(path: str | os.PathLike, stage: str) -> GriddedBRDF | CompactBRDF | LobeHarmonics | LobeTensor:
-    """Read what evaluation of one stage needs, "grid" or "compact", and nothing else.
+def load_stage(
+    path: str | os.PathLike, stage: str, wavelength_nm: npt.ArrayLike | None = None
+) -> GriddedBRDF | CompactBRDF | LobeHarmonics | LobeTensor:
+    """Read what `evaluate` needs of one stage, for all wavelengths or a few, and nothing else.
+
+    The values are those of the whole result, but for rounding. Of a large array only the chunks
+    around the wavelengths are read.
+
+    Args:
+        path: A result of `run`.
+        stage: "grid" or "compact".
+        wavelength_nm: Where the record will be evaluated [nm], [query], in the measured range; the measured wavelengths
+            unless given.
+
+    Returns:
+        The record. That of the grid holds only the measured wavelengths [nm] around those asked for, up to two on
+        each side: pass these to `evaluate`, and no others. Its `brdf` is None where `field` is what evaluates it;
+        `extrapolated`, `standard_error`, `residual_variance` and `needed` are always None. The compact form is
+        small, and whole.
 
     Raises:
-        UserError: as `load`, or the result has no such stage.
+        UserError: as `load`, the result has no such stage, or a wavelength is not in the measured range.
     """
     with open_result(path) as file:
-        if stage not in file:
-            raise UserError(f"{path}: stage {stage}: not in this result, found {', '.join(file)}")
-        return _read_grid(file) if stage == "grid" else read_compact(group_of(file, stage))
+        found = [name for name in ("grid", "compact") if name in file]
+        if stage not in found:
+            raise UserError(f"{path}: stage {stage}: not in this result, found {', '.join(found) or 'none'}")
+        group = group_of(file, stage)
+        if wavelength_nm is not None:
+            wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, float))
+            measured_nm = read(group, "wavelength_nm")
+            wrong = wavelength_nm[outside_range(wavelength_nm, measured_nm)]
+            if wrong.size or not wavelength_nm.size:
+                shown = f"{wrong[0]:g}" if wrong.size else "none"
+                expected = f"expected {measured_nm[0]:g} to {measured_nm[-1]:g} nm, as measured"
+                raise UserError(f"{path}: wavelength: found {shown}, {expected}")
+        return read_compact(group) if stage == "compact" else read_query(group, _field_of(file), wavelength_nm)
 
 
-def _read_grid(file: h5py.File) -> GriddedBRDF:
-    return read_grid(group_of(file, "grid"), group_of(file, "field") if "field" in file else None)
+def _field_of(file: h5py.File) -> h5py.Group | None:
+    return group_of(file, "field") if "field" in file else None
 
 
 @one_line_errors

@@ -20,7 +20,7 @@ from sbrdf_jax.evaluation import (
     evaluate_on_axes,
     evaluate_standard_error,
 )
-from sbrdf_jax.interpolation import spectral_weights
+from sbrdf_jax.interpolation import neighbours, spectral_weights
 from sbrdf_jax.representation.paper import compact_coefficient
 from sbrdf_jax.runtime import compile_clock
 
@@ -123,6 +123,19 @@ def test_between_wavelengths_it_is_scipys_hermite_cubic(rng, nodes):
     np.testing.assert_allclose(weights[np.isin(at, nodes)], np.eye(len(nodes)), rtol=0, atol=ROUND)
     if len(nodes) > 2:
         np.testing.assert_allclose(weights @ (nodes - 500) ** 2, (at - 500) ** 2, rtol=0, atol=8e4 * 10 * ROUND)
+
+
+@pytest.mark.parametrize("nodes", [WAVELENGTH_NM[:n] for n in (1, 2, 3, 4, 8)], ids=len)
+def test_neighbours_are_all_that_interpolation_needs(rng, nodes):
+    ends_and_nodes = np.concatenate([nodes, [nodes[0] - 1e-9, nodes[-1] + 1e-9]])
+    single = [np.array([at]) for at in (*ends_and_nodes, *rng.uniform(nodes[0], nodes[-1], 20))]
+    for at in (*single, *rng.uniform(nodes[0], nodes[-1], (10, 2))):
+        near = neighbours(at, nodes)
+        assert len(near) <= 4 * len(at)
+        alone = np.zeros((len(at), len(nodes)))
+        alone[:, near] = spectral_weights(jnp.asarray(at), jnp.asarray(nodes[near]))
+        whole = spectral_weights(jnp.asarray(at), jnp.asarray(nodes))
+        np.testing.assert_allclose(alone, whole, rtol=0, atol=10 * ROUND)
 
 
 def test_outside_the_measured_wavelengths_is_nan_and_nothing_else(rng):

@@ -436,10 +436,10 @@ def test_a_result_holds_the_field_and_its_errors(samples, tmp_path, rng):
         assert np.isfinite(file["field/model_residual"][()]).all() and file["field/curve"].shape[0] == 2
         assert file["validation/expected_error"].shape == (300, 2)
         assert 0.5 < file["validation/scores/coverage"][()] < 0.9
-    stage = load_stage(path, "grid")
-    nodes = np.meshgrid(stage.theta_i, stage.theta_o, stage.phi_o, indexing="ij")
-    np.testing.assert_allclose(evaluate_in_chunks(stage, *nodes), stage.brdf, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(evaluate_standard_error(stage, *nodes)[0], stage.standard_error, rtol=1e-6)
+    stage, grid = load_stage(path, "grid"), load(path).gridded
+    nodes = np.meshgrid(grid.theta_i, grid.theta_o, grid.phi_o, indexing="ij")
+    np.testing.assert_allclose(evaluate_in_chunks(stage, *nodes), grid.brdf, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(evaluate_standard_error(stage, *nodes)[0], grid.standard_error, rtol=1e-6)
     (tmp_path / "figures").mkdir()
     without_compact = dataclasses.replace(load(path), field=None, compact=None, metrics={})
     names = [figure.name for figure in draw_figures(without_compact, tmp_path / "figures")]
@@ -449,7 +449,7 @@ def test_a_result_holds_the_field_and_its_errors(samples, tmp_path, rng):
     assert main([*words, "--output", str(tmp_path / "values.csv")]) == 0
     header, first, _ = (tmp_path / "values.csv").read_text().splitlines()
     assert header.split(",")[3:] == ["500nm", "500nm_se", "600nm", "600nm_se"]
-    assert [float(x) for x in first.split(",")][3::2] == pytest.approx(np.asarray(stage.brdf)[1, 2, 2])
+    assert [float(x) for x in first.split(",")][3::2] == pytest.approx(np.asarray(grid.brdf)[1, 2, 2])
 
 
 def test_held_out_samples_of_a_measured_paint(shared):

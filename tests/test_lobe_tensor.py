@@ -181,9 +181,9 @@ def test_the_group_alone_evaluates_to_the_same_numbers(amber, tmp_path, rng):
         part["compact"].visititems(lambda _, item: sizes.append(item.size))
         assert part["compact"].attrs["method"] == "lobe_tensor"
         assert sum(sizes) == part["compact"].attrs["stored_numbers"] == stored_numbers(found)
-    alone = store.load_stage(tmp_path / "part.h5", "compact")
     angles = rng.uniform(0, 1.5, (3, 50))
     wavelength = np.array([400.0, 512.3])
+    alone = store.load_stage(tmp_path / "part.h5", "compact", wavelength)
     expected = evaluate_in_chunks(found, *angles, wavelength)
     for loaded in (alone, again.compact):
         np.testing.assert_allclose(evaluate_in_chunks(loaded, *angles, wavelength), expected, rtol=1e-9, atol=1e-12)

@@ -116,7 +116,7 @@ def test_the_layout_is_the_contracts(tmp_path, result):
             assert isinstance(file.attrs[name], str)
         for name, shape in shapes.items():
             assert dataset_of(file, name).shape == shape, name
-        assert dataset_of(file, "grid/brdf").chunks == (1, 5, 13, 11)
+        assert dataset_of(file, "grid/brdf").chunks == (1, 5, 13, 8)
         assert dataset_of(file, "grid/brdf").dtype == np.float64
         assert file["spectral/coefficients"].attrs["basis"] == "fourier"
         assert file["spectral/coefficients"].attrs["coefficient_order"] == "a_0,a_1,b_1,a_2,b_2"

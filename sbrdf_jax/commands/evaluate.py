@@ -40,18 +40,17 @@ def run(args: argparse.Namespace) -> int:
     from sbrdf_jax.files import whole_file
     from sbrdf_jax.store import load_stage
 
-    stage = load_stage(args.result, args.stage)
+    wanted = None if args.wavelengths is None else parse_wavelengths(args.wavelengths)
+    stage = load_stage(args.result, args.stage, wanted)
     if args.uncertainty and getattr(stage, "field", None) is None:
         raise UserError(f"--uncertainty: the {args.stage} stage of {args.result} has no standard errors")
-    measured = np.asarray(measured_wavelengths(stage))
-    wanted = None if args.wavelengths is None else parse_wavelengths(args.wavelengths, measured)
     texts, angles = read_directions(Path(args.at))
     output = Path(args.output)
     for source in (args.at, args.result):
         if output.exists() and output.samefile(source):
             raise UserError(f"--output: {args.output} is also read, expected another file")
 
-    names = wavelength_names(measured if wanted is None else wanted)
+    names = wavelength_names(np.asarray(measured_wavelengths(stage)) if wanted is None else wanted)
     columns = [f"{name}{end}" for name in names for end in (("", "_se") if args.uncertainty else ("",))]
     radians = np.deg2rad(np.asarray(angles, float).reshape(-1, 3))
     with whole_file(output) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
@@ -68,23 +67,18 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def parse_wavelengths(text: str, measured) -> list[float]:
+def parse_wavelengths(text: str) -> list[float]:
     """Parse `--wavelengths` [nm].
 
     Raises:
-        UserError: not numbers, or outside the measured range.
+        UserError: not numbers.
     """
     from sbrdf_jax.errors import UserError
 
-    low, high = float(measured[0]), float(measured[-1])
     try:
-        wanted = [float(word) for word in text.split(",")]
+        return [float(word) for word in text.split(",")]
     except ValueError:
         raise UserError(f"--wavelengths: found {text!r}, expected numbers [nm] parted by commas") from None
-    for wavelength in wanted:
-        if not low <= wavelength <= high:
-            raise UserError(f"--wavelengths: found {wavelength:g}, expected {low:g} to {high:g} nm, as measured")
-    return wanted
 
 
 def wavelength_names(wavelength_nm) -> list[str]:

@@ -34,6 +34,8 @@ DIRECTIONS_AT_A_TIME = 1024
 WHITEN_BLOCK = 256  # rows of a triangular matrix that are multiplied as one full block
 MOST_GATHERED = 8  # wavelengths; measured: 1.8 us a direction against 6.1 for 1, 5.0 and 7.4 for 6, 46 and 16 for 31
 
+LAST_AXIS = ("wavelength_nm", "half", "azimuth", "multiplier", "model_residual")  # is the wavelength's, in a field
+
 
 @pytree()
 class MeasuredLobe:

@@ -5,16 +5,15 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from sbrdf_jax.resampling.guided.field import GuidedField
+from sbrdf_jax.resampling.guided.field import LAST_AXIS, GuidedField
 from sbrdf_jax.resampling.guided.fit import GuidedFit
 
-_LAST_AXIS = ("wavelength_nm", "half", "azimuth", "multiplier", "model_residual")
 _PROOF = ("kkt_residual", "num_steps", "status")
 
 
 def take_field(field: GuidedField, index: np.ndarray) -> GuidedField:
     """Return a field at some of its wavelengths, by mask or index."""
-    parts = {name: jnp.asarray(getattr(field, name))[..., index] for name in _LAST_AXIS}
+    parts = {name: jnp.asarray(getattr(field, name))[..., index] for name in LAST_AXIS}
     lobe = dataclasses.replace(field.lobe, log_amplitude=jnp.asarray(field.lobe.log_amplitude)[:, index])
     return dataclasses.replace(field, lobe=lobe, **parts)
 
@@ -33,7 +32,7 @@ def join_fits(one: GuidedFit, other: GuidedFit) -> GuidedFit:
     def joined(first, second):
         return np.concatenate([np.asarray(first), np.asarray(second)], axis=-1)[..., order]
 
-    parts = {name: jnp.asarray(joined(getattr(one.field, name), getattr(other.field, name))) for name in _LAST_AXIS}
+    parts = {name: jnp.asarray(joined(getattr(one.field, name), getattr(other.field, name))) for name in LAST_AXIS}
     amplitude = jnp.asarray(joined(one.field.lobe.log_amplitude, other.field.lobe.log_amplitude))
     lobe = dataclasses.replace(other.field.lobe, log_amplitude=amplitude)
     proof = {name: joined(getattr(one, name), getattr(other, name)) for name in _PROOF}
@@ -53,7 +52,7 @@ def with_dead_wavelengths(
     """Return the field at more wavelengths: `missing` is 0 where nothing was seen, nan where a value was not finite."""
     if known.all():
         return field
-    names = [name for name in _LAST_AXIS if name != "wavelength_nm"]
+    names = [name for name in LAST_AXIS if name != "wavelength_nm"]
     parts = {name: jnp.asarray(spread(np.asarray(getattr(field, name)), known, missing)) for name in names}
     amplitude = spread(np.asarray(field.lobe.log_amplitude), known, np.full(len(known), -np.inf))
     lobe = dataclasses.replace(field.lobe, log_amplitude=jnp.asarray(amplitude))
