@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sbrdf_jax.devices import over_lanes
 from sbrdf_jax.records import Status, pytree
 
 ROUND_STEPS = 100  # steps between two looks from the host
@@ -281,7 +282,7 @@ def advance_gradient(
     operator: NormalOperator,
     rhs: Float[Array, "unknown lane"],
     state: ProjectedGradientState,
-    lipschitz: Float[Array, ""],
+    lipschitz: Float[Array, " lane"],
     tolerance: Float[Array, ""],
     last_step: Int[Array, ""],
 ) -> ProjectedGradientState:
@@ -297,7 +298,7 @@ def advance_gradient(
 
     def take_step(state: ProjectedGradientState) -> ProjectedGradientState:
         active = is_active(state)[None, :]
-        iterate = jnp.maximum(state.point - (state.point_image - target) / lipschitz, 0.0)
+        iterate = jnp.maximum(state.point - (state.point_image - target) / lipschitz[None, :], 0.0)
         iterate = jnp.where(active, iterate, state.iterate)
         image = operator.multiply(iterate / scale) / scale
         image = jnp.where(active, image, state.image)
@@ -385,7 +386,11 @@ def _solution(operator, rhs, start, method):
 
 
 def _hand_over(operator, rhs, newton, tolerance):
-    """Judge the Newton point by a fresh product; what it lacks is left to the accelerated gradient."""
+    """Judge the Newton point by a fresh product; what it lacks is left to the accelerated gradient.
+
+    Returns:
+        Its state, and the Lipschitz constant for each lane: the largest eigenvalue, 1 where all have converged.
+    """
     scale = scale_of(operator)
     state = begin_gradient(operator, rhs, jnp.maximum(newton.point, 0.0) / scale[:, None], newton.num_steps)
     lipschitz = jax.lax.cond(
@@ -393,7 +398,7 @@ def _hand_over(operator, rhs, newton, tolerance):
         lambda: jnp.ones((), rhs.dtype),
         lambda: largest_eigenvalue(operator, scale),
     )
-    return state, lipschitz
+    return state, jnp.broadcast_to(lipschitz, rhs.shape[1:])
 
 
 def _solution_forward(operator, rhs, start, method):
@@ -487,18 +492,18 @@ def solve_in_rounds(
     return _end(operator, rhs, state, tolerance)
 
 
-@jax.jit
+@functools.partial(over_lanes, axis=-1, shared=(0,))
 def _begin(operator, rhs, start):
     _, safe = _finite_part(rhs)
     return begin_newton(operator, safe, _feasible(start, safe)), safe
 
 
-_newton_round = jax.jit(advance_newton)
-_gradient_round = jax.jit(advance_gradient)
-_checked = jax.jit(_hand_over)
+_newton_round = over_lanes(advance_newton, axis=-1, shared=(0, 3, 4))
+_gradient_round = over_lanes(advance_gradient, axis=-1, shared=(0, 4, 5))
+_checked = over_lanes(_hand_over, axis=-1, shared=(0, 3))
 
 
-@jax.jit
+@functools.partial(over_lanes, axis=-1, shared=(0, 3))
 def _end(operator, rhs, state, tolerance):
     finite, _ = _finite_part(rhs)
     value = state.iterate / scale_of(operator)[:, None]

@@ -16,6 +16,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from sbrdf_jax.devices import over_lanes
 from sbrdf_jax.models.model import Model, cosines
 from sbrdf_jax.records import Status
 
@@ -141,7 +142,7 @@ def _fit_lanes(model, samples, value, start) -> Lane:
     return Lane(*(np.concatenate(part)[:count] for part in zip(*parts, strict=True)))
 
 
-@functools.partial(jax.jit, static_argnames="model")
+@functools.partial(over_lanes, axis=0, shared=(1, 2), static=(0,))
 def _fit_batch(model, directions, weight, value, start):
     c = cosines(*directions)
     return jax.vmap(functools.partial(_fit_lane, model, c, jnp.sqrt(weight)))(value, start)

@@ -5,6 +5,7 @@ one kind of lobe. Batches have fixed shapes, so another material of the same geo
 nothing, however many pairs it has.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sbrdf_jax.angles import MIRROR_AZIMUTH, angle_between
+from sbrdf_jax.devices import over_lanes
 from sbrdf_jax.lobes import lobe_exponents
 from sbrdf_jax.records import Status
 from sbrdf_jax.representation.background import fit_background
@@ -202,7 +204,7 @@ def _geometry(peak_theta, theta_o, phi_o):
     return alpha, jnp.moveaxis(lobe_exponents(alpha), 0, 1)
 
 
-@jax.jit
+@functools.partial(over_lanes, axis=0, shared=(4, 5, 6))
 def _search_pairs(value, alpha, exponent, critical_angle, widths, functions, weight):
     """Return even background [pair, candidate, even], then the fields of `Lobe` [pair, candidate, kind]."""
 
@@ -227,7 +229,7 @@ def _search_pairs(value, alpha, exponent, critical_angle, widths, functions, wei
     return background, *(jnp.stack(parts, axis=-1) for parts in zip(*found, strict=True))
 
 
-@jax.jit
+@functools.partial(over_lanes, axis=0, shared=(3, 4))
 def _fit_backgrounds(value, alpha, critical_angle, functions, weight):
     """Return backgrounds [pair, candidate, function]."""
 
@@ -238,7 +240,7 @@ def _fit_backgrounds(value, alpha, critical_angle, functions, weight):
 
 
 _exponents = jax.jit(lobe_exponents)
-_fit_batch = jax.jit(jax.vmap(fit_lobe, in_axes=(0, 0, 0, None, 0, 0)))
+_fit_batch = over_lanes(jax.vmap(fit_lobe, in_axes=(0, 0, 0, None, 0, 0)), axis=0, shared=(3,))
 
 
 def least(error: Float[np.ndarray, " pair *choice"]) -> Int[np.ndarray, " pair"]:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sbrdf_jax.devices import over_lanes
 from sbrdf_jax.nnls import DenseNormal, ProjectedNewton, solve_nnls
 from sbrdf_jax.records import Status
 from sbrdf_jax.resampling.guided.centres import PADDING_NOISE
@@ -29,7 +30,7 @@ class Bounded(NamedTuple):
     status: jax.Array  # [wavelength]
 
 
-@functools.partial(jax.jit, static_argnames="method")
+@functools.partial(over_lanes, axis=-1, shared=(0, 1, 2), static=(5,))
 def solve_bounded(
     prior: Float[Array, "centre centre"],
     inverse: Float[Array, "centre centre"],

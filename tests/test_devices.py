@@ -1,0 +1,144 @@
+"""Lanes on several devices: the arrays lie on all of them, and the answer is that of one."""
+
+import json
+import os
+import subprocess
+import sys
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from sbrdf_jax.builtin import measure
+from sbrdf_jax.cli import main
+from sbrdf_jax.devices import over_lanes
+from sbrdf_jax.formats import write_samples
+
+NUM_DEVICES = 4
+FOUR = f"--xla_force_host_platform_device_count={NUM_DEVICES}"
+AGREEMENT = 1e-10  # relative to the largest value of a dataset
+CONFIG = """
+input: {path: amber.h5}
+grid: {theta_i_step_deg: 22.5, theta_o_step_deg: 22.5, phi_o_step_deg: 45}
+represent: {max_degree: 1}
+output: {report: false}
+"""
+METHODS = {
+    "paper": ["resample.method=paper", "represent.method=paper", "encode.coefficients=5"],
+    "guided": ["resample.method=guided"],
+}
+# Runs each method, then prints how every array that came back from all devices lay on them:
+# [method, shape, number of devices, shape of each shard].
+PROGRAM = """
+import json, sys
+from sbrdf_jax import devices
+from sbrdf_jax.cli import main
+
+seen, home = [], devices._home
+
+def look(leaf, count, axis):
+    shards = [list(shard.data.shape) for shard in leaf.addressable_shards]
+    seen.append((method, list(leaf.shape), len(leaf.sharding.device_set), shards))
+    return home(leaf, count, axis)
+
+devices._home = look
+for method, words in json.loads(sys.argv[1]).items():
+    assert main(["run", "config.yaml", f"output.path=four_{method}.h5", *words]) == 0
+print(json.dumps(seen))
+"""
+
+
+def on_four(program: str, *words: str, cwd=None) -> str:
+    """Return what a program prints that has four simulated devices."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {FOUR}"
+    environment = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-c", program, *words]
+    done = subprocess.run(command, env=environment, cwd=cwd, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """A folder with the results of one device and of four, and how the arrays of the latter lay."""
+    folder = tmp_path_factory.mktemp("devices")
+    raw = measure("amber_glass", count=160)
+    wavelengths = np.linspace(0, len(raw.wavelength_nm) - 1, 6).round().astype(int)  # four devices do not divide 6
+    part = {"wavelength_nm": raw.wavelength_nm[wavelengths], "value": raw.value[:, wavelengths]}
+    write_samples(folder / "amber.h5", raw.__class__(**{**vars(raw), **part}))
+    (folder / "config.yaml").write_text(CONFIG)
+    for method, words in METHODS.items():
+        places = [f"input.path={folder}/amber.h5", f"output.path={folder}/one_{method}.h5"]
+        assert main(["run", str(folder / "config.yaml"), *places, *words]) == 0
+    return folder, json.loads(on_four(PROGRAM, json.dumps(METHODS), cwd=folder).splitlines()[-1])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_four_devices_give_the_answer_of_one(results, method):
+    folder, _ = results
+    compared = []
+    with h5py.File(folder / f"one_{method}.h5") as one, h5py.File(folder / f"four_{method}.h5") as four:
+
+        def compare(name, item):
+            if not isinstance(item, h5py.Dataset) or name.startswith("timing") or item.dtype.kind not in "fiu":
+                return
+            value, other = item[()], four[name][()]
+            size = np.max(np.abs(value), where=np.isfinite(value), initial=0.0)
+            if name.endswith(("kkt_residual", "model_residual")):
+                size = 1.0  # what is left of the rounding, relative to what it was
+            np.testing.assert_allclose(other, value, rtol=0, atol=AGREEMENT * size, err_msg=name)
+            compared.append(name)
+
+        one.visititems(compare)
+        assert sum(1 for _ in compared) > 20 and "grid/brdf" in compared
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_lanes_lie_on_four_devices(results, method):
+    _, seen = results
+    arrays = [(shape, devices, shards) for of, shape, devices, shards in seen if of == method]
+    assert arrays and all(devices == NUM_DEVICES == len(shards) for _, devices, shards in arrays)
+    for shape, _, shards in arrays:
+        assert all(shard == shards[0] for shard in shards)
+        assert np.prod(shape) == NUM_DEVICES * np.prod(shards[0])
+    solves = [shards[0] for shape, _, shards in arrays if len(shape) == 2 and shape[1] == 8]  # 6, filled up
+    assert solves and all(shard[1] == 2 for shard in solves)
+    if method == "paper":  # batches of the lobe search: 16 pairs
+        assert any(shape[0] == 16 and shards[0][0] == 4 for shape, _, shards in arrays)
+
+
+def test_each_device_stops_by_itself_and_lanes_need_not_divide():
+    program = """
+import jax, jax.numpy as jnp, numpy as np
+from sbrdf_jax.devices import over_lanes
+
+def count_down(step, lanes):
+    steps = jax.lax.while_loop(lambda s: jnp.any(s[0] > 0), lambda s: (s[0] - step, s[1] + 1), (lanes, 0 * lanes))[1]
+    return {"steps": steps}  # of the slowest lane of the device
+
+call = over_lanes(count_down, axis=0, shared=(0,))
+for lanes in ([1, 2, 3, 4, 5, 6, 7], [3], [], [1, 9]):
+    print(call(jnp.asarray(1), jnp.asarray(lanes, int))["steps"].tolist())
+with jax.default_device(jax.devices()[1]):
+    print(call(jnp.asarray(1), jnp.asarray([1, 9]))["steps"].tolist())
+print(jax.jit(lambda lanes: call(jnp.asarray(1), lanes))(jnp.asarray([1, 9]))["steps"].tolist())
+"""
+    lines = [json.loads(line) for line in on_four(program).splitlines()]
+    assert lines == [[2, 2, 4, 4, 6, 6, 7], [3], [], [1, 9], [9, 9], [9, 9]]
+
+
+def test_on_one_device_it_is_jit():
+    traced = []
+
+    def double(x, power):
+        traced.append(x)
+        return 2 * x**power
+
+    assert len(jax.local_devices()) == 1
+    call = over_lanes(double, axis=0, static=(1,))
+    for _ in range(2):
+        np.testing.assert_array_equal(call(jnp.arange(3), 2), [0, 2, 8])
+    assert len(traced) == 1
