@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import jaxpr_as_fun
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 AXIS = "lanes"
@@ -71,20 +72,37 @@ def over_lanes(
 
 
 def _on_all(function, axis, shared, static, mesh, *arguments):
-    """Run the function on each device's lanes; traced once for each set of shapes."""
+    """Run the function on each device's lanes; traced once for each set of shapes.
+
+    It is traced for the lanes of one device before there is a mesh, because lineax compares
+    shapes that inside `shard_map` know of theirs, with shapes that do not.
+    """
     places = [place for place in range(len(arguments)) if place not in static]
-
-    def on_own_lanes(*arrays):
-        given = dict(zip(places, arrays, strict=True))
-        return function(*(given.get(place, argument) for place, argument in enumerate(arguments)))
-
     arrays = tuple(arguments[place] for place in places)
     specs = tuple(
         jax.tree.map(lambda leaf, place=place: PartitionSpec() if place in shared else _split(leaf, axis), array)
         for place, array in zip(places, arrays, strict=True)
     )
-    answer = jax.tree.map(lambda leaf: _split(leaf, axis), jax.eval_shape(on_own_lanes, *arrays))
-    return jax.shard_map(on_own_lanes, mesh=mesh, in_specs=specs, out_specs=answer, check_vma=False)(*arrays)
+    own = jax.tree.map(
+        lambda leaf, spec: jax.ShapeDtypeStruct(NamedSharding(mesh, spec).shard_shape(leaf.shape), leaf.dtype),
+        arrays,
+        specs,
+    )
+
+    def on_own_lanes(*arrays):
+        given = dict(zip(places, arrays, strict=True))
+        return function(*(given.get(place, argument) for place, argument in enumerate(arguments)))
+
+    traced, answer = jax.make_jaxpr(on_own_lanes, return_shape=True)(*own)
+    leaves, structure = jax.tree.flatten(answer)
+    found = jax.shard_map(
+        lambda *arrays: jaxpr_as_fun(traced)(*jax.tree.leaves(arrays)),
+        mesh=mesh,
+        in_specs=specs,
+        out_specs=[_split(leaf, axis) for leaf in leaves],
+        check_vma=False,
+    )(*arrays)
+    return jax.tree.unflatten(structure, found)
 
 
 def _home(leaf: jax.Array, count: int, axis: int) -> jax.Array:

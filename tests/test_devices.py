@@ -65,7 +65,7 @@ def on_four(program: str, *words: str, cwd=None) -> str:
 def results(tmp_path_factory):
     """A folder with the results of one device and of four, and how the arrays of the latter lay."""
     folder = tmp_path_factory.mktemp("devices")
-    raw = measure("amber_glass", count=160)
+    raw = measure("amber_glass", count=40)
     wavelengths = np.linspace(0, len(raw.wavelength_nm) - 1, 6).round().astype(int)  # four devices do not divide 6
     part = {"wavelength_nm": raw.wavelength_nm[wavelengths], "value": raw.value[:, wavelengths]}
     write_samples(folder / "amber.h5", raw.__class__(**{**vars(raw), **part}))
