@@ -21,15 +21,13 @@ NUM_DEVICES = 4
 FOUR = f"--xla_force_host_platform_device_count={NUM_DEVICES}"
 AGREEMENT = 1e-10  # relative to the largest value of a dataset
 CONFIG = """
-input: {path: amber.h5}
+input: {path: amber.h5, bilateral: true}
 grid: {theta_i_step_deg: 22.5, theta_o_step_deg: 22.5, phi_o_step_deg: 45}
-represent: {max_degree: 1}
+encode: {basis: fourier, coefficients: 5}
+represent: {method: paper, max_degree: 1, lobe: angle_squared}
 output: {report: false}
 """
-METHODS = {
-    "paper": ["resample.method=paper", "represent.method=paper", "encode.coefficients=5"],
-    "guided": ["resample.method=guided"],
-}
+METHODS = ("paper", "guided")  # of resampling
 # Runs each method, then prints how every array that came back from all devices lay on them:
 # [method, shape, number of devices, shape of each shard].
 PROGRAM = """
@@ -45,20 +43,29 @@ def look(leaf, count, axis):
     return home(leaf, count, axis)
 
 devices._home = look
-for method, words in json.loads(sys.argv[1]).items():
-    assert main(["run", "config.yaml", f"output.path=four_{method}.h5", *words]) == 0
+for method in sys.argv[1:]:
+    words = [f"resample.method={method}", f"output.path=four_{method}.h5"]
+    assert main(["run", "config.yaml", *words]) == 0
 print(json.dumps(seen))
 """
 
 
-def on_four(program: str, *words: str, cwd=None) -> str:
-    """Return what a program prints that has four simulated devices."""
+def start_on_four(program: str, *words: str, cwd=None) -> subprocess.Popen:
+    """Start a program that has four simulated devices."""
     flags = f"{os.environ.get('XLA_FLAGS', '')} {FOUR}"
     environment = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", program, *words]
-    done = subprocess.run(command, env=environment, cwd=cwd, capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout
+    return subprocess.Popen(
+        command, env=environment, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def lines_of(process: subprocess.Popen) -> list:
+    """Wait for a program that prints JSON lines."""
+    with process:
+        printed, said = process.communicate(timeout=600)
+    assert process.returncode == 0, said[-2000:]
+    return [json.loads(line) for line in printed.splitlines()]
 
 
 @pytest.fixture(scope="module")
@@ -70,10 +77,11 @@ def results(tmp_path_factory):
     part = {"wavelength_nm": raw.wavelength_nm[wavelengths], "value": raw.value[:, wavelengths]}
     write_samples(folder / "amber.h5", raw.__class__(**{**vars(raw), **part}))
     (folder / "config.yaml").write_text(CONFIG)
-    for method, words in METHODS.items():
-        places = [f"input.path={folder}/amber.h5", f"output.path={folder}/one_{method}.h5"]
-        assert main(["run", str(folder / "config.yaml"), *places, *words]) == 0
-    return folder, json.loads(on_four(PROGRAM, json.dumps(METHODS), cwd=folder).splitlines()[-1])
+    four = start_on_four(PROGRAM, *METHODS, cwd=folder)
+    for method in METHODS:
+        words = [f"input.path={folder}/amber.h5", f"resample.method={method}", f"output.path={folder}/one_{method}.h5"]
+        assert main(["run", str(folder / "config.yaml"), *words]) == 0
+    return folder, lines_of(four)[-1]
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -106,8 +114,7 @@ def test_the_lanes_lie_on_four_devices(results, method):
         assert np.prod(shape) == NUM_DEVICES * np.prod(shards[0])
     solves = [shards[0] for shape, _, shards in arrays if len(shape) == 2 and shape[1] == 8]  # 6, filled up
     assert solves and all(shard[1] == 2 for shard in solves)
-    if method == "paper":  # batches of the lobe search: 16 pairs
-        assert any(shape[0] == 16 and shards[0][0] == 4 for shape, _, shards in arrays)
+    assert any(shape[0] == 16 and shards[0][0] == 4 for shape, _, shards in arrays)  # pairs of the lobe search
 
 
 def test_each_device_stops_by_itself_and_lanes_need_not_divide():
@@ -126,8 +133,7 @@ with jax.default_device(jax.devices()[1]):
     print(call(jnp.asarray(1), jnp.asarray([1, 9]))["steps"].tolist())
 print(jax.jit(lambda lanes: call(jnp.asarray(1), lanes))(jnp.asarray([1, 9]))["steps"].tolist())
 """
-    lines = [json.loads(line) for line in on_four(program).splitlines()]
-    assert lines == [[2, 2, 4, 4, 6, 6, 7], [3], [], [1, 9], [9, 9], [9, 9]]
+    assert lines_of(start_on_four(program)) == [[2, 2, 4, 4, 6, 6, 7], [3], [], [1, 9], [9, 9], [9, 9]]
 
 
 def test_on_one_device_it_is_jit():
