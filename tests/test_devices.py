@@ -28,24 +28,70 @@ represent: {method: paper, max_degree: 1, lobe: angle_squared}
 output: {report: false}
 """
 METHODS = ("paper", "guided")  # of resampling
-# Runs each method, then prints how every array that came back from all devices lay on them:
-# [method, shape, number of devices, shape of each shard].
-PROGRAM = """
+# `look` notes how each array that comes back from all devices lies on them:
+# [what is computed, shape, number of devices, shape of each shard].
+LOOK = """
 import json, sys
 from sbrdf_jax import devices
-from sbrdf_jax.cli import main
 
 seen, home = [], devices._home
 
 def look(leaf, count, axis):
     shards = [list(shard.data.shape) for shard in leaf.addressable_shards]
-    seen.append((method, list(leaf.shape), len(leaf.sharding.device_set), shards))
+    seen.append((what, list(leaf.shape), len(leaf.sharding.device_set), shards))
     return home(leaf, count, axis)
 
 devices._home = look
-for method in sys.argv[1:]:
-    words = [f"resample.method={method}", f"output.path=four_{method}.h5"]
+"""
+PIPELINE = f"""{LOOK}
+from sbrdf_jax.cli import main
+
+for what in sys.argv[1:]:
+    words = [f"resample.method={{what}}", f"output.path=four_{{what}}.h5"]
     assert main(["run", "config.yaml", *words]) == 0
+print(json.dumps(seen))
+"""
+SOLVERS = f"""{LOOK}
+import jax, numpy as np
+from sbrdf_jax.runtime import set_up_jax
+
+set_up_jax()
+import jax.numpy as jnp
+from sbrdf_jax.nnls import DenseNormal, ProjectedNewton, solve_in_rounds
+from sbrdf_jax.representation.lane_search import _fit_batch
+from sbrdf_jax.resampling.guided.bounds import solve_bounded
+
+rng = np.random.default_rng(5)
+matrix, target = rng.standard_normal((60, 40)), rng.standard_normal((60, 6))
+target[3, 2] = np.nan
+method, eye = ProjectedNewton(tolerance=1e-10), jnp.eye(40)
+normal, rhs = DenseNormal(jnp.asarray(matrix.T @ matrix)), jnp.asarray(matrix.T @ target)
+prior, residual = jnp.asarray(matrix.T @ matrix / 60), jnp.asarray(rng.standard_normal((40, 6)))
+exponent = rng.uniform(0, 3, (6, 30))
+lobe = 2 * np.exp(-exponent / 0.4), np.ones((6, 30), bool), exponent, np.ones(30), (np.ones(6), np.full(6, 0.2))
+
+def solve():
+    global what
+    what = "rounds"
+    yield solve_in_rounds(normal, rhs, method)
+    what = "many rounds"
+    yield solve_in_rounds(normal, rhs, ProjectedNewton(tolerance=1e-30, max_steps=250))
+    what = "bounded"
+    yield solve_bounded(prior, jnp.linalg.inv(prior + eye), jnp.ones(40), residual, 0 * residual - 0.3, method)
+
+four = list(solve())
+looked = len(seen)
+with jax.default_device(jax.devices()[0]):
+    one = list(solve())
+assert len(seen) == looked
+for few, many in zip(jax.tree.leaves(one), jax.tree.leaves(four), strict=True):
+    assert many.sharding.device_set == {{jax.devices()[0]}}
+    size = np.max(np.abs(few), where=np.isfinite(few), initial=1.0)  # a residual is relative to 1
+    np.testing.assert_allclose(many, few, rtol=0, atol=1e-10 * size)
+what = "lobes"
+found = _fit_batch(*lobe, np.tile([0.01, 30.0], (6, 1)))
+np.testing.assert_allclose(np.stack([found.height, found.width]), [[2.0] * 6, [0.4] * 6], rtol=1e-6)
+assert np.isnan(four[0].value[:, 2]).all() and np.isfinite(four[0].value[:, 3]).all()
 print(json.dumps(seen))
 """
 
@@ -77,13 +123,14 @@ def results(tmp_path_factory):
     part = {"wavelength_nm": raw.wavelength_nm[wavelengths], "value": raw.value[:, wavelengths]}
     write_samples(folder / "amber.h5", raw.__class__(**{**vars(raw), **part}))
     (folder / "config.yaml").write_text(CONFIG)
-    four = start_on_four(PROGRAM, *METHODS, cwd=folder)
+    four = start_on_four(PIPELINE, *METHODS, cwd=folder)
     for method in METHODS:
         words = [f"input.path={folder}/amber.h5", f"resample.method={method}", f"output.path={folder}/one_{method}.h5"]
         assert main(["run", str(folder / "config.yaml"), *words]) == 0
     return folder, lines_of(four)[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_four_devices_give_the_answer_of_one(results, method):
     folder, _ = results
@@ -101,20 +148,34 @@ def test_four_devices_give_the_answer_of_one(results, method):
             compared.append(name)
 
         one.visititems(compare)
-        assert sum(1 for _ in compared) > 20 and "grid/brdf" in compared
+        assert len(compared) > 20 and "grid/brdf" in compared
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
-def test_the_lanes_lie_on_four_devices(results, method):
+def test_the_lanes_of_a_run_lie_on_four_devices(results, method):
     _, seen = results
-    arrays = [(shape, devices, shards) for of, shape, devices, shards in seen if of == method]
-    assert arrays and all(devices == NUM_DEVICES == len(shards) for _, devices, shards in arrays)
-    for shape, _, shards in arrays:
-        assert all(shard == shards[0] for shard in shards)
-        assert np.prod(shape) == NUM_DEVICES * np.prod(shards[0])
+    arrays = [array for of, *array in seen if of == method]
+    assert_spread(arrays)
     solves = [shards[0] for shape, _, shards in arrays if len(shape) == 2 and shape[1] == 8]  # 6, filled up
     assert solves and all(shard[1] == 2 for shard in solves)
     assert any(shape[0] == 16 and shards[0][0] == 4 for shape, _, shards in arrays)  # pairs of the lobe search
+
+
+def assert_spread(arrays: list) -> None:
+    """Each array lies on all devices, an equal part on each."""
+    assert arrays
+    for shape, devices, shards in arrays:
+        assert devices == NUM_DEVICES == len(shards) and all(shard == shards[0] for shard in shards)
+        assert np.prod(shape) == NUM_DEVICES * np.prod(shards[0])
+
+
+def test_solvers_and_fits_on_four_devices_answer_as_on_one():
+    seen = lines_of(start_on_four(SOLVERS))[-1]
+    for what in ("rounds", "many rounds", "bounded", "lobes"):
+        arrays = [array for of, *array in seen if of == what]
+        assert_spread(arrays)
+        assert all(8 in shape for shape, _, _ in arrays)  # 6 lanes, filled up
 
 
 def test_each_device_stops_by_itself_and_lanes_need_not_divide():
