@@ -75,7 +75,7 @@ def _sha256(path: Path) -> str:
 
 
 if __name__ == "__main__":
-    executors.ComputeMaterial = lambda: compute
+    executors.compute_material = compute
     slurm.PROGRAM = (sys.executable, __file__)
     sys.argv[0] = "sbrdf"
     main_exit("batch")

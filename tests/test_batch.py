@@ -33,7 +33,7 @@ from sbrdf_jax.runtime import worker_environment
 @pytest.fixture
 def batch(monkeypatch):
     """The command with quick computing, two workers unless it is told otherwise; its exit code."""
-    monkeypatch.setattr(executors, "ComputeMaterial", lambda: quick_library.compute)
+    monkeypatch.setattr(executors, "compute_material", quick_library.compute)
     for name, value in worker_environment(1).items():
         monkeypatch.setenv(name, value)  # the command sets them; so they are as before when the test is over
     return lambda library, *words: main(["batch", str(library), "--workers", "2", *words])

@@ -1,17 +1,23 @@
 """What a batch computes is what `run` computes, whoever runs it, and materials of one geometry share what they can."""
 
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
 import h5py
 import jax
 import numpy as np
 from problems import scattered_samples
 
-from sbrdf_jax.batch.attempt import ComputeMaterial, attempt
+from sbrdf_jax.batch.attempt import attempt, compute_material
+from sbrdf_jax.batch.dask_cluster import attempt_at_worker
 from sbrdf_jax.batch.library import Library, load_library
 from sbrdf_jax.batch.memory import Memory
 from sbrdf_jax.batch.states import State
+from sbrdf_jax.batch.worker import Work
 from sbrdf_jax.cli import main
 from sbrdf_jax.formats import write_samples
 from sbrdf_jax.hdf5 import dataset_of
+from sbrdf_jax.resampling import kept
 from sbrdf_jax.resampling.kept import Kept
 
 BASE = """
@@ -51,7 +57,7 @@ def test_a_material_of_a_batch_is_what_run_computes(tmp_path, monkeypatch):
     inverted = []
     original = Kept.inverse
     monkeypatch.setattr(Kept, "inverse", lambda self, op: inverted.append(original(self, op)) or inverted[-1])
-    memory, compute, compiled = Memory(), ComputeMaterial(), []
+    memory, compute, compiled = Memory(), compute_material, []
     first = attempt(library.materials[0], compute, memory)
     jax.monitoring.register_event_duration_secs_listener(lambda event, duration_secs, **kwargs: compiled.append(event))
     second = attempt(library.materials[1], compute, memory)
@@ -69,3 +75,15 @@ def test_a_material_of_a_batch_is_what_run_computes(tmp_path, monkeypatch):
     (tmp_path / "raw" / "m0.h5").write_bytes(b"nonsense")
     failed = attempt(library.materials[0], compute, memory)
     assert failed is not None and failed.state is State.FAILED and "m0.h5" in failed.reason
+
+
+def test_tasks_of_one_thread_share_what_depends_on_angles(tmp_path, monkeypatch):
+    library, inverted, original = small_library(tmp_path, 3), [], kept.invert_normal
+    monkeypatch.setattr(kept, "invert_normal", lambda operator: inverted.append(None) or original(operator))
+    task = pickle.dumps(Work(compute_material))  # as it reaches a worker of dask, anew for each material
+    for materials, expected in ((library.materials[:2], 1), (library.materials[2:], 2)):
+        with ThreadPoolExecutor(1) as thread:
+            for material in materials:
+                outcome = thread.submit(attempt_at_worker, material, pickle.loads(task)).result()
+                assert outcome is not None and outcome.state is State.DONE and outcome.computed
+        assert len(inverted) == expected

@@ -4,10 +4,10 @@ Every executor calls `attempt`, in a process of its own choice. Nothing heavy is
 """
 
 import dataclasses
+import threading
 import time
 import traceback
 from collections.abc import Callable
-from typing import Any
 
 from sbrdf_jax.batch.library import Material
 from sbrdf_jax.batch.locks import hold
@@ -23,6 +23,8 @@ from sbrdf_jax.batch.states import (
 from sbrdf_jax.errors import UserError
 
 Compute = Callable[[Material], None]  # writes the result
+
+_this_thread = threading.local()
 
 
 def attempt(material: Material, compute: Compute, memory: Memory, *, retry_failed: bool = False) -> Outcome | None:
@@ -57,45 +59,36 @@ def give_up(material: Material, reason: str, memory: Memory) -> Outcome:
     return Outcome(material.name, State.FAILED, reason, computed=True)
 
 
-class ComputeMaterial:
-    """Runs one material after the other as `sbrdf run` does, with its log beside its result.
+def compute_material(material: Material) -> None:
+    """Write the result of a material as `sbrdf run` does, with its log beside it.
 
-    It keeps what depends on angles alone for the next; that does not travel to another process.
+    What depends on angles alone is kept for the next material of this thread: a process of the local
+    executor has one, a worker of dask may have several, and materials of two geometries at a time.
     """
+    start = time.perf_counter()
+    from sbrdf_jax.formats import read
+    from sbrdf_jax.pipeline import prepare
+    from sbrdf_jax.resampling.kept import Kept
+    from sbrdf_jax.runtime import set_up_jax
+    from sbrdf_jax.single_run import open_progress, run_to_file
+    from sbrdf_jax.stopping import before_stopping
 
-    def __init__(self):
-        """Begin with nothing known."""
-        self._kept: Any = None
-
-    def __call__(self, material: Material) -> None:
-        """Write the result of a material."""
-        start = time.perf_counter()
-        from sbrdf_jax.formats import read
-        from sbrdf_jax.pipeline import prepare
-        from sbrdf_jax.resampling.kept import Kept
-        from sbrdf_jax.runtime import set_up_jax
-        from sbrdf_jax.single_run import open_progress, run_to_file
-        from sbrdf_jax.stopping import before_stopping
-
-        set_up_jax()
-        self._kept = self._kept or Kept()
-        options = material.options
-        with (
-            open_progress(material.result, quiet=True) as progress,
-            before_stopping(lambda word: progress.log(f"stopped: {word}")),
-        ):
-            try:
-                raw = read(options.input.path, options.input)
-                ready = prepare(raw, options)
-                run_to_file(raw, ready, options, progress, time.perf_counter() - start, self._kept)
-            except Exception:
-                for line in traceback.format_exc().splitlines():
-                    progress.log(line)
-                raise
-
-    def __reduce__(self):
-        """Travel without what is known."""
-        return ComputeMaterial, ()
+    set_up_jax()
+    if not hasattr(_this_thread, "kept"):
+        _this_thread.kept = Kept()
+    options = material.options
+    with (
+        open_progress(material.result, quiet=True) as progress,
+        before_stopping(lambda word: progress.log(f"stopped: {word}")),
+    ):
+        try:
+            raw = read(options.input.path, options.input)
+            ready = prepare(raw, options)
+            run_to_file(raw, ready, options, progress, time.perf_counter() - start, _this_thread.kept)
+        except Exception:
+            for line in traceback.format_exc().splitlines():
+                progress.log(line)
+            raise
 
 
 def _compute(material: Material, compute: Compute, memory: Memory) -> Outcome:

@@ -65,7 +65,7 @@ def run_dask(
 
 def _run(distributed: Any, client: Any, materials: Sequence[Material], work: Work, watcher: Watcher) -> None:
     memory = Memory()
-    futures = {client.submit(_attempt, material, work, pure=False): material for material in materials}
+    futures = {client.submit(attempt_at_worker, material, work, pure=False): material for material in materials}
     queue = distributed.as_completed(futures)
     for future in queue:
         material = futures.pop(future)
@@ -74,14 +74,14 @@ def _run(distributed: Any, client: Any, materials: Sequence[Material], work: Wor
         except distributed.KilledWorker as error:
             outcome = give_up(material, f"its worker died: {' '.join(str(error).split())[:120]}", memory)
         if outcome is None:  # another batch is at it
-            again = client.submit(_attempt, material, work, SECONDS_BETWEEN_TRIES, pure=False)
+            again = client.submit(attempt_at_worker, material, work, SECONDS_BETWEEN_TRIES, pure=False)
             futures[again] = material
             queue.add(again)
         else:
             watcher.ended(outcome)
 
 
-def _attempt(material: Material, work: Work, delay: float = 0.0) -> Outcome | None:
+def attempt_at_worker(material: Material, work: Work, delay: float = 0.0) -> Outcome | None:
     """What a worker of dask does; in a thread of it."""
     import time
 

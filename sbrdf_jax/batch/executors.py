@@ -3,7 +3,7 @@
 import os
 from collections.abc import Sequence
 
-from sbrdf_jax.batch.attempt import ComputeMaterial
+from sbrdf_jax.batch.attempt import compute_material
 from sbrdf_jax.batch.library import Material
 from sbrdf_jax.batch.local import Watcher, run_local
 from sbrdf_jax.batch.options import ExecutorOptions
@@ -19,7 +19,7 @@ def execute(options: ExecutorOptions, materials: Sequence[Material], watcher: Wa
     """
     if not materials:
         return
-    work = Work(ComputeMaterial(), retry_failed)
+    work = Work(compute_material, retry_failed)
     workers, threads = divide_cores(options, len(materials))
     environment = worker_environment(threads, options.compile_cache)
     if options.kind == "dask":
