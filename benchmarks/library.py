@@ -6,7 +6,8 @@ The materials differ in roughness and colour and share their directions, as one 
 has one thread. Seconds are wall-clock; CPU seconds of a material are beside them, because another process on the
 machine stretches the former. Separate runs have the threads that `run` takes by itself; their time is that of a
 few, scaled.
-Writes one JSON line with all numbers at the end.
+Prints a table beside what is wanted of 64 materials, then one JSON line with all numbers. On a machine whose cores are
+shared with other work, the ratio of the workers says more of that than of them: `load_before` tells.
 """
 
 import argparse
@@ -23,6 +24,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+WANTED_TWO_OVER_ONE, WANTED_AFTER_FIRST, WANTED_OVER_SEPARATE = 1.7, 1.5, 8
 BASE = "input: {bilateral: true}\noutput: {report: false}\n"
 
 
@@ -91,13 +93,34 @@ def main() -> None:
             record[f"workers_{workers}"] = batch(folder, workers, chosen.overrides)
             print(f"{workers} workers: {record[f'workers_{workers}']}", flush=True)
         each = separate(folder, chosen.separate, chosen.overrides)
-    one, two = record["workers_1"]["seconds"], record["workers_2"]["seconds"]
-    record |= {"separate_each": each, "two_over_one": one / two, "separate_over_two": each * chosen.materials / two}
-    print(f"separate: {each:.1f} s each, {each * chosen.materials:.0f} s for {chosen.materials}")
-    print(
-        f"two workers are {one / two:.2f} times as fast as one, and {record['separate_over_two']:.1f} as separate runs"
-    )
+    for line in summary(record, each):
+        print(line)
     print(json.dumps(record))
+
+
+def summary(record: dict, each: float) -> list[str]:
+    """Add the ratios to a record, and return its table: what was measured beside what it should be."""
+    count, few = record["materials"], record["separate"]
+    one, two = record["workers_1"], record["workers_2"]
+    all_separate = each * count
+    record |= {
+        "separate_each": each,
+        "two_over_one": one["seconds"] / two["seconds"],
+        "separate_over_one": all_separate / one["seconds"],
+        "separate_over_two": all_separate / two["seconds"],
+    }
+    after, cpu = one["median_after_first"], one["cpu_median_after_first"]
+    return [
+        f"{count} materials of {record['samples']} samples x {record['wavelengths']} wavelengths",
+        f"one worker, one thread    {one['seconds']:8.1f} s",
+        f"two workers, one thread   {two['seconds']:8.1f} s    {record['two_over_one']:.2f} times as fast"
+        f" (wanted: {WANTED_TWO_OVER_ONE})",
+        f"each after the first      {after:8.2f} s    median of one worker, {cpu:.2f} s of CPU"
+        f" (wanted: {WANTED_AFTER_FIRST} s)",
+        f"separate `run` processes  {all_separate:8.1f} s    {each:.1f} s each, the mean of {few}, times {count}:"
+        f" {record['separate_over_one']:.1f} times one worker, {record['separate_over_two']:.1f} times two"
+        f" (wanted: {WANTED_OVER_SEPARATE})",
+    ]
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.library import summary
 from benchmarks.peers import missing
 from benchmarks.plots import draw
 from benchmarks.records import Record, Timing, as_line, machine, read_lines, record_of, timed
@@ -64,3 +65,12 @@ def test_tables_and_plots_are_made_of_records(tmp_path, capsys):
 
 def test_missing_peers_are_named_as_they_are_installed():
     assert set(missing()) <= {"optax", "osqp", "scikit-learn"}
+
+
+def test_the_table_of_a_library_scales_separate_runs_and_says_so():
+    worker = {"median_after_first": 2.0, "cpu_median_after_first": 1.9}
+    record = {"materials": 64, "samples": 9, "wavelengths": 3, "separate": 2}
+    record |= {"workers_1": {"seconds": 160.0} | worker, "workers_2": {"seconds": 80.0} | worker}
+    text = "\n".join(summary(record, 20.0))
+    assert (record["two_over_one"], record["separate_over_one"], record["separate_over_two"]) == (2.0, 8.0, 16.0)
+    assert "20.0 s each, the mean of 2, times 64" in text and "2.00 times as fast (wanted: 1.7)" in text
