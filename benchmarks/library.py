@@ -4,8 +4,8 @@
 
 The materials differ in roughness and colour and share their directions, as one goniometer measures them. Each worker
 has one thread. Seconds are wall-clock; CPU seconds of a material are beside them, because another process on the
-machine stretches the former. Separate runs have the threads that `run` takes by itself; their time is that of a
-few, scaled.
+machine stretches the former. Below 5 materials the second worker is not used: it would compile for too few. Separate
+runs have the threads that `run` takes by itself; their time is that of a few, scaled.
 Prints a table beside what is wanted of 64 materials, then one JSON line with all numbers. On a machine whose cores are
 shared with other work, the ratio of the workers says more of that than of them: `load_before` tells.
 """
