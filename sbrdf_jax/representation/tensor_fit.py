@@ -11,7 +11,7 @@ and each would compile anew.
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy.linalg.lapack
 from jaxtyping import Float
 
 RIDGE = 1e-5  # relative to the diagonal: what no value shows stays small, and directions between run not wild
@@ -64,8 +64,13 @@ class TensorFit:
         )
 
     def orthonormal(self, mode: int, factor):
-        """Make the columns of a factor orthonormal over the rows of its mode, as far as they are independent."""
-        return factor @ np.linalg.pinv(np.linalg.qr(self.roots[mode] @ factor)[1], rcond=1e-10)
+        """Make the columns of a factor orthonormal over the rows of its mode, as far as they are independent.
+
+        Returns:
+            The factor, and the change of basis that undoes it: their product is what was given.
+        """
+        change = np.linalg.qr(self.roots[mode] @ factor)[1]
+        return factor @ np.linalg.pinv(change, rcond=1e-10), change
 
     def start(self) -> list[np.ndarray]:
         """Return factors of rank 2: constant and linear in both polar angles, the leading lobes in direction."""
@@ -74,7 +79,7 @@ class TensorFit:
         scaled = scipy.linalg.solve_triangular(self.roots[2], moment, trans="T")
         lobes = scipy.linalg.solve_triangular(self.roots[2], np.linalg.eigh(scaled @ scaled.T)[1][:, :-3:-1])
         lines = (np.vander(np.linspace(-1, 1, f.shape[1]), 2)[:, : f.shape[1]] for f in (n.theta_i, n.theta_o))
-        return [self.orthonormal(mode, factor) for mode, factor in enumerate((*lines, lobes))]
+        return [self.orthonormal(mode, factor)[0] for mode, factor in enumerate((*lines, lobes))]
 
     def project(self, w) -> Projection:
         """Return what the directional factor makes of Gram matrices and moments."""
@@ -94,34 +99,35 @@ class TensorFit:
         gain = 2 * (core * right).sum(axis=0) - (core * (matrix @ core)).sum(axis=0)
         return core.reshape(a, b, q, c), gain
 
-    def sweep(self, factors, channels: int) -> list[np.ndarray]:
-        """Renew each factor once, by the first `channels` alone."""
+    def sweep(self, factors, channels: int) -> tuple[list[np.ndarray], float]:
+        """Renew the core and each factor once, by the first `channels` alone.
+
+        Returns:
+            The factors, and by how much those that were given lower the error.
+        """
         u, v, w = factors
         n, projection = self.normal, self.project(w)
-        for mode in range(3):
-            core = self.solve_core(u, v, projection)[0][..., :channels]
-            gram, moment = projection.gram, projection.moment[..., :channels]
-            a, b, q, c = core.shape
-            if mode == 0:
-                part = np.tensordot(n.theta_o @ v, core, (1, 1)).transpose(0, 2, 3, 1)  # [o, q, c, a]
-                squares = _channel_pairs(part).reshape(-1, a * a)
-                matrix = gram.reshape(len(gram), -1) @ squares
-                right = moment.reshape(len(moment), -1) @ part.reshape(-1, a)
-                u = self.orthonormal(0, _solve_mode(n.theta_i, matrix, right))
-            elif mode == 1:
-                part = np.tensordot(n.theta_i @ u, core, (1, 0)).transpose(0, 2, 3, 1)  # [i, q, c, b]
-                squares = _channel_pairs(part).reshape(-1, b * b)
-                matrix = np.swapaxes(gram, 0, 1).reshape(gram.shape[1], -1) @ squares
-                right = np.swapaxes(moment, 0, 1).reshape(moment.shape[1], -1) @ part.reshape(-1, b)
-                v = self.orthonormal(1, _solve_mode(n.theta_o, matrix, right))
-            else:
-                part = self.amplitudes(u, v, core)  # [i, o, q, c]
-                squares = (part @ np.swapaxes(part, 2, 3)).reshape(-1, q * q)
-                size = n.gram.shape[-1]
-                matrix = _unpair(n.gram.reshape(-1, size * size).T @ squares, size, q)
-                right = np.tensordot(n.moment[..., :channels], part, ((0, 1, 3), (0, 1, 3)))
-                w = self.orthonormal(2, _solve(matrix, right.reshape(-1, 1)).reshape(size, q))
-        return [u, v, w]
+        core, gain = self.solve_core(u, v, projection)
+        core = core[..., :channels]
+        gram, moment = projection.gram, projection.moment[..., :channels]
+        a, b, q, c = core.shape
+        part = np.tensordot(n.theta_o @ v, core, (1, 1)).transpose(0, 2, 3, 1)  # [o, q, c, a]
+        matrix = gram.reshape(len(gram), -1) @ _channel_pairs(part).reshape(-1, a * a)
+        right = moment.reshape(len(moment), -1) @ part.reshape(-1, a)
+        u, change = self.orthonormal(0, _solve_mode(n.theta_i, matrix, right))
+        core = np.tensordot(change, core, (1, 0))
+        part = np.tensordot(n.theta_i @ u, core, (1, 0)).transpose(0, 2, 3, 1)  # [i, q, c, b]
+        matrix = np.swapaxes(gram, 0, 1).reshape(gram.shape[1], -1) @ _channel_pairs(part).reshape(-1, b * b)
+        right = np.swapaxes(moment, 0, 1).reshape(moment.shape[1], -1) @ part.reshape(-1, b)
+        v, change = self.orthonormal(1, _solve_mode(n.theta_o, matrix, right))
+        core = np.tensordot(change, core, (1, 1)).transpose(1, 0, 2, 3)
+        part = self.amplitudes(u, v, core)  # [i, o, q, c]
+        squares = (part @ np.swapaxes(part, 2, 3)).reshape(-1, q * q)
+        size = n.gram.shape[-1]
+        matrix = _unpair(n.gram.reshape(-1, size * size).T @ squares, size, q)
+        right = np.tensordot(n.moment[..., :channels], part, ((0, 1, 3), (0, 1, 3)))
+        w, _ = self.orthonormal(2, _solve(matrix, right.reshape(-1, 1)).reshape(size, q))
+        return [u, v, w], gain[:channels].sum()
 
     def amplitudes(self, u, v, core) -> Float[np.ndarray, "i o q channel"]:
         """Return what multiplies the directional factor at every pair of polar angles."""
@@ -149,7 +155,7 @@ class TensorFit:
             scaled = scipy.linalg.solve_triangular(root, matrix, trans="T")
             leading = np.linalg.eigh(scaled @ scaled.T)[1][:, -1:]
             column = scipy.linalg.solve_triangular(root, leading)
-            found.append(self.orthonormal(mode, np.concatenate([factors[mode], column], axis=1)))
+            found.append(self.orthonormal(mode, np.concatenate([factors[mode], column], axis=1))[0])
         return found
 
 
@@ -182,5 +188,7 @@ def _solve(matrix, right):
     diagonal = np.diag(matrix)
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scaled = matrix * scale[:, None] * scale + RIDGE * np.eye(len(matrix))
-    factor = scipy.linalg.cho_factor(scaled, overwrite_a=True, check_finite=False)
-    return scale[:, None] * scipy.linalg.cho_solve(factor, scale[:, None] * right, check_finite=False)
+    _, found, failed = scipy.linalg.lapack.dposv(scaled, scale[:, None] * right, lower=1, overwrite_a=1, overwrite_b=1)
+    if failed:
+        raise np.linalg.LinAlgError("normal equations are not positive definite")
+    return scale[:, None] * found

@@ -8,7 +8,7 @@ from sbrdf_jax.representation.tensor_fit import Factors, TensorFit
 
 MOST_CELLS = 900  # of the core for one channel; its normal equations have so many unknowns
 LEAST_GAIN = 2e-3  # of the squared error; a step that gains less is noise, and growth ends
-FIRST_SWEEPS, LAST_SWEEPS = 3, 4
+MOST_SWEEPS, SWEEP_GAIN = 30, 0.02  # before and after the growth; of the squared error
 NO_ERROR = 1e-24  # squared, relative; below it is rounding
 
 
@@ -30,9 +30,7 @@ def grow(
         first_channels: Channels to start with.
     """
     energy = fit.normal.energy
-    factors, channels = fit.start(), first_channels
-    for _ in range(FIRST_SWEEPS):
-        factors = fit.sweep(factors, channels)
+    factors, channels = _settle(fit, fit.start(), first_channels), first_channels
     while True:
         projection = fit.project(factors[2])
         core, gain = fit.solve_core(*factors[:2], projection)
@@ -59,10 +57,21 @@ def grow(
         _, gained, wider, wider_channels = max(steps, key=lambda step: step[0], default=(0.0, 0.0, factors, channels))
         if gained < LEAST_GAIN * error:
             break
-        factors, channels = fit.sweep(wider, wider_channels), wider_channels
-    for _ in range(LAST_SWEEPS):
-        factors = fit.sweep(factors, channels)
+        factors, channels = fit.sweep(wider, wider_channels)[0], wider_channels
+    factors = _settle(fit, factors, channels)
     return Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2]))[0][..., :channels])
+
+
+def _settle(fit: TensorFit, factors, channels: int) -> list[np.ndarray]:
+    """Sweep until the error hardly falls any more."""
+    before = np.inf
+    for _ in range(MOST_SWEEPS):
+        factors, gained = fit.sweep(factors, channels)
+        error = fit.normal.energy - gained
+        if before - error <= SWEEP_GAIN * error:
+            break
+        before = error
+    return factors
 
 
 def _score(error: float, gained: float, cost: int) -> float:
