@@ -14,6 +14,7 @@ import numpy as np
 import scipy.linalg.lapack
 from jaxtyping import Float
 
+NOTHING = 1e-30  # of the largest diagonal element: a column that has died out, whose unknowns become 0
 RIDGE = 1e-5  # relative to the diagonal: what no value shows stays small, and directions between run not wild
 
 
@@ -186,7 +187,7 @@ def _solve_mode(functions, matrix, right):
 def _solve(matrix, right):
     """Solve normal equations after scaling their diagonal to 1, with a small ridge."""
     diagonal = np.diag(matrix)
-    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scale = 1 / np.sqrt(np.where(diagonal > NOTHING * diagonal.max(), diagonal, 1.0))
     scaled = matrix * scale[:, None] * scale + RIDGE * np.eye(len(matrix))
     _, found, failed = scipy.linalg.lapack.dposv(scaled, scale[:, None] * right, lower=1, overwrite_a=1, overwrite_b=1)
     if failed:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-BLOCK = 16  # both axes are padded to a multiple; so many rows of theta_o at a time
+ROWS, COLUMNS = 16, 32  # of theta_o and of phi_o in one call: one shape, one compilation
 
 
 def on_axes(
@@ -25,19 +25,20 @@ def on_axes(
         needed: Which combinations; at least one. The function is called for the axes around them.
         by_direction: More arguments, of each direction.
     """
-    columns = np.flatnonzero(needed.any(axis=0))
-    rows = np.flatnonzero(needed.any(axis=1))
-    phi_o = _padded(phi_o[columns])
-    blocks = []
-    for start in range(0, len(rows), BLOCK):
-        some = rows[start : start + BLOCK]
-        arrays = (_padded(_padded(a[np.ix_(some, columns)]).T).T for a in by_direction)
-        found = function(_padded(theta_o[some]), phi_o, *arrays)
-        inside = needed[np.ix_(some, columns)]
-        blocks.append([np.asarray(a)[: len(some), : len(columns)][inside] for a in found])
-    return tuple(np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    rows, columns = np.flatnonzero(needed.any(axis=1)), np.flatnonzero(needed.any(axis=0))
+    found = None
+    for some in _blocks(rows, ROWS):
+        for others in _blocks(columns, COLUMNS):
+            block = np.ix_(some, others)
+            parts = function(theta_o[some], phi_o[others], *(a[block] for a in by_direction))
+            if found is None:
+                found = tuple(np.empty((*needed.shape, *np.shape(part)[2:])) for part in parts)
+            for whole, part in zip(found, parts, strict=True):
+                whole[block] = np.asarray(part)
+    assert found is not None
+    return tuple(whole[needed] for whole in found)
 
 
-def _padded(array: np.ndarray) -> np.ndarray:
-    """Repeat the last entry of the first axis up to a multiple of the block: few shapes, few compilations."""
-    return np.concatenate([array, np.repeat(array[-1:], -len(array) % BLOCK, axis=0)])
+def _blocks(index: np.ndarray, size: int) -> np.ndarray:
+    """Return indices as rows of one size; the last one is filled by its last index."""
+    return np.pad(index, (0, -len(index) % size), mode="edge").reshape(-1, size)
