@@ -6,6 +6,7 @@ from sbrdf_jax.colour import ColourMatching
 from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.options import ErrorBudget, RepresentOptions
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, SpectralField
+from sbrdf_jax.runtime import require_float64
 
 
 def represent(
@@ -18,6 +19,9 @@ def represent(
         options: Method, target and limits.
         gridded: The grid stage, where there is one: other methods than "paper" are then measured
             against its spectra and fitted between its nodes too.
+
+    Raises:
+        UserError: float64 is off in JAX.
     """
     return represent_with_plan(field, options, gridded)[0]
 
@@ -33,6 +37,7 @@ def represent_with_plan(
     # here, because evaluation, which these methods use, imports the values of this package's records
     from sbrdf_jax.representation import lobe_harmonics, lobe_tensor, paper
 
+    require_float64()
     if options.method == "paper":
         return paper.represent(field, options)
     method = lobe_harmonics if options.method == "lobe_harmonics" else lobe_tensor

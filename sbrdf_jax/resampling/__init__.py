@@ -11,6 +11,7 @@ from sbrdf_jax.records import GriddedBRDF, RawSamples
 from sbrdf_jax.resampling.guided import resample_guided
 from sbrdf_jax.resampling.kept import Kept
 from sbrdf_jax.resampling.paper import resample_paper
+from sbrdf_jax.runtime import require_float64
 
 
 def resample(
@@ -37,8 +38,10 @@ def resample(
         The field on the grid, at the wavelengths and incident angles that are needed.
 
     Raises:
+        UserError: float64 is off in JAX.
         ValueError: The method is not built.
     """
+    require_float64()
     kept = kept or Kept()
     if options.method == "paper":
         say = None if report is None else (lambda done, total: report(f"{done} of {total} wavelengths converged"))

@@ -126,29 +126,21 @@ def covariance_on_axes(
     The modes of both polar angles are summed once for all azimuths: a tenth of the work.
     """
     at = coordinates_on_axes(theta_i, theta_o, phi_o, theta_limit)
-    pole = dataclasses.replace(at, **{name: getattr(at, name)[:, 0] for name in ("theta_i", "theta_o")})
     places = group_coordinates(centre, theta_limit)
-    total = _covariance_on_axes(variance, at, pole, places)
+    along_i, along_o = axis_features(at.theta_i[:, 0], THETA), axis_features(at.theta_o[:, 0], THETA)
+    centre_i, centre_o = axis_features(places.theta_i[:, 0], THETA), axis_features(places.theta_o, THETA)
+    polar = along_i[:, :, None] * along_o[:, None, :]  # [o, mode of theta_i, mode of theta_o]
     if variance.reciprocal:
-        total = (total + _covariance_on_axes(variance, at, exchanged(pole), places)) / 2
-    prior = prior_variance(variance, flatten(at))
-    return total.reshape(*at.half.shape, -1), prior.reshape(at.half.shape)
-
-
-def _covariance_on_axes(variance: ModeVariance, at: Coordinates, pole: Coordinates, centres: Coordinates):
-    """One way of `covariance_on_axes`: azimuths and half angles of `at`, both polar angles of `pole`."""
-    along_i, along_o = axis_features(pole.theta_i, THETA), axis_features(pole.theta_o, THETA)
-    centre_i, centre_o = axis_features(centres.theta_i[:, 0], THETA), axis_features(centres.theta_o, THETA)
-    total = 0.0
+        polar = (polar + jnp.swapaxes(polar, 1, 2)) / 2
+    total, prior = 0.0, 0.0
     for name, (axis, _, _) in GRIDS.items():
-        modes = jnp.asarray(getattr(variance, name))
-        pairs = along_i[None, :, :] * centre_i[:, None, :]  # [group, o, mode of theta_i]
-        weight = jnp.tensordot(pairs, modes, (2, 1)) * along_o[None, :, None, :]  # [group, o, first, mode of theta_o]
-        at_centre = jnp.einsum("gofk,gmk->gofm", weight, centre_o)
-        at_centre = at_centre * jnp.swapaxes(axis_features(getattr(centres, name), axis), 1, 2)[:, None]
-        around = axis_features(getattr(at, name), axis)
-        total = total + jnp.einsum("opf,gofm->opgm", around, at_centre)
-    return total
+        around, at_centre = axis_features(getattr(at, name), axis), axis_features(getattr(places, name), axis)
+        weighted = polar[:, None] * jnp.asarray(getattr(variance, name))[None]  # [o, first mode, two modes]
+        prior = prior + jnp.einsum("of,opf->op", jnp.sum(weighted * polar[:, None], axis=(2, 3)), around**2)
+        of_group = jnp.tensordot(centre_i, weighted, (1, 2))  # [group, o, first mode, mode of theta_o]
+        of_centre = jnp.einsum("gofk,gmk->gofm", of_group, centre_o) * jnp.swapaxes(at_centre, 1, 2)[:, None]
+        total = total + jnp.einsum("opf,gofm->opgm", around, of_centre)
+    return total.reshape(*at.half.shape, -1), prior
 
 
 def mode_sums(
