@@ -103,7 +103,7 @@ class TargetOptions:
     numbers: Annotated[int, Ge(1)] | None = None
     """Numbers stored per incident angle."""
     error: Share | None = None
-    """Relative error (equation 18) at every incident angle."""
+    """Relative error (equation 18) at every incident angle; lobe_tensor: at most 5 times that between the nodes."""
     delta_e: Positive | None = None
     """Colour difference, CIE Delta E 2000."""
 

@@ -20,6 +20,7 @@ from sbrdf_jax.records import GriddedBRDF, SpectralField, Status
 from sbrdf_jax.representation import represent, represent_with_plan
 from sbrdf_jax.representation.direction_functions import direction_functions, num_direction_functions
 from sbrdf_jax.representation.tensor_fit import Normal, TensorFit
+from sbrdf_jax.representation.tensor_growth import grow
 from sbrdf_jax.representation.tensor_value import pad_ranks
 from sbrdf_jax.splines import spline_weights
 
@@ -129,6 +130,20 @@ def test_each_step_is_plain_least_squares(rng):
         core = np.moveaxis(np.tensordot(change, core, (1, mode)), 0, mode)  # the model is the same
     for found, wanted in zip(once, by_hand, strict=True):
         np.testing.assert_allclose(found @ np.linalg.pinv(found), wanted @ np.linalg.pinv(wanted), rtol=0, atol=loose)
+
+
+def test_a_promise_that_settling_would_break_is_kept(rng):
+    at_i, at_o, w = rng.normal(size=(5, 4)), rng.normal(size=(6, 4)), rng.normal(size=(5, 6, 3, 8))
+    gram, moment = w @ np.swapaxes(w, 2, 3), w @ rng.normal(size=(5, 6, 8, 2))
+    fit = TensorFit(Normal(gram, moment, 1e3, at_i, at_o))
+    asked = []
+
+    def is_enough(factors):
+        asked.append(factors)
+        return len(asked) == 1  # before settling, and not after
+
+    found = grow(fit, lambda a, b, q, c: 1, 10.0, is_enough, first_channels=2)
+    assert len(asked) == 2 and found is asked[0]
 
 
 def test_a_sharp_lobe_costs_few_numbers_at_the_nodes_and_between_them(amber):

@@ -37,6 +37,7 @@ class HalfField(NamedTuple):
     blocks: tuple[Block, ...]
     known: Bool[np.ndarray, " theta_i"]  # incident angles that count: finite, not zero throughout, and with data
     asymmetry: float  # largest relative size of what is odd in phi_o, which is dropped
+    is_field: bool = False  # what is between the nodes is known, not interpolated
 
     @property
     def nodes(self) -> Block:
@@ -100,7 +101,7 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
         cell = cell[:-1] & cell[1:]
         between = _evaluate_needed(gridded, mid_i, mid_o, mid_phi, cell)[..., finite]
         blocks.append(_block(mid_i, mid_o, mid_phi, between, twins, BETWEEN_WEIGHT * less, cell))
-    return HalfField(tuple(blocks), known, asymmetry)
+    return HalfField(tuple(blocks), known, asymmetry, is_field=True)
 
 
 def cells_between(needed: Bool[np.ndarray, "i o p"]) -> Bool[np.ndarray, "i o-1 p-1"]:

@@ -19,14 +19,15 @@ from sbrdf_jax.representation.direction_functions import (
     half_angle_floor,
     num_direction_functions,
 )
-from sbrdf_jax.representation.half_field import HalfField, half_field
-from sbrdf_jax.representation.target import Target, is_met, make_target, measured
+from sbrdf_jax.representation.half_field import Block, HalfField, half_field
+from sbrdf_jax.representation.target import Target, is_met, make_target, measured, node_errors
 from sbrdf_jax.representation.tensor_fit import Factors, Normal, TensorFit
 from sbrdf_jax.representation.tensor_growth import grow
 from sbrdf_jax.splines import spline_weights
 
 MOST_FUNCTIONS = 13  # of one polar angle; the factors are smooth, however fine the grid
 ASYMMETRIC = 0.01  # relative size of the part odd in phi_o from which a user is told that it is dropped
+MOST_BETWEEN = 5.0  # times a target's error may be that between the nodes, of a field that is known there
 
 
 class Layout(NamedTuple):
@@ -158,23 +159,32 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
     fit = TensorFit(Normal(gram, moment, total, at_rows, at_columns))
 
     nodes, counts = half.nodes, half.known[place]
-    function = np.stack([_functions(angle, nodes.theta_o, nodes.phi_o, floor) for angle in nodes.theta_i])
-    node_rows, node_columns = np.searchsorted(rows, nodes.theta_i), np.searchsorted(columns, nodes.theta_o)
+    seen = [_Seen.of(block, rows, columns, floor) for block in half.blocks[: 2 if half.is_field else 1]]
     if "delta_e" in (target.kind, *(stop.kind for stop in target.stops)) and matching is None:
         matching = colour.colour_matching(np.asarray(field.basis.wavelength_nm))
-    twins = np.r_[np.full(len(nodes.phi_o) - 1, 2.0), 1.0]
+
+    def value(part: _Seen, factors: Factors) -> np.ndarray:
+        amplitude = fit.amplitudes(factors.theta_i, factors.theta_o, factors.core)[np.ix_(part.rows, part.columns)]
+        value = ((part.function @ factors.direction) @ amplitude) @ vectors[: factors.core.shape[3]]
+        return np.maximum(value / scale[part.rows][:, None, None, None], 0.0)
 
     def measure(target: Target, factors: Factors) -> float:
         stored = layout.numbers(*factors.ranks, factors.core.shape[3])
         if target.kind in ("ratio", "numbers"):
-            return measured(target, stored, nodes.brdf, nodes.brdf, twins, counts, None)
-        amplitude = fit.amplitudes(factors.theta_i, factors.theta_o, factors.core)[np.ix_(node_rows, node_columns)]
-        value = ((function @ factors.direction) @ amplitude) @ vectors[: factors.core.shape[3]]
-        value = np.maximum(value / scale[node_rows][:, None, None, None], 0.0)
-        return measured(target, stored, value, nodes.brdf, twins, counts, matching, nodes.needed)
+            return measured(target, stored, nodes.brdf, nodes.brdf, seen[0].twins, counts, None)
+        found = value(seen[0], factors)
+        return measured(target, stored, found, nodes.brdf, seen[0].twins, counts, matching, nodes.needed)
 
     def is_enough(factors: Factors) -> bool:
-        return bool(target.stops) and all(is_met(stop, measure(stop, factors)) for stop in target.stops)
+        if not target.stops or not all(is_met(stop, measure(stop, factors)) for stop in target.stops):
+            return False
+        allowed = MOST_BETWEEN * min((stop.value for stop in target.stops if stop.kind == "error"), default=np.inf)
+        if allowed >= 1 or not half.is_field:
+            return True
+        part, block = seen[1], half.blocks[1]
+        mask = block.needed[..., None]
+        errors = node_errors(np.where(mask, value(part, factors), 0.0), np.where(mask, block.brdf, 0.0), part.twins)
+        return bool(errors[counts].max(initial=0.0) <= allowed)
 
     first = min(2, count) if layout.stores_vectors else count
     # what whole hemispheres may cost is too much for a part of them, but for the spectra that all share
@@ -184,6 +194,23 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
     achieved, used = measure(target, factors), factors.core.shape[3]
     basis = vector_basis(field.basis.wavelength_nm, vectors[:used]) if layout.stores_vectors else field.basis
     return factors._replace(core=factors.core @ to_coefficient[:used, :used]), log_scale, basis, achieved
+
+
+class _Seen(NamedTuple):
+    """A block as the factors see it."""
+
+    rows: np.ndarray  # among those of the fit
+    columns: np.ndarray
+    function: Float[np.ndarray, "i o p function"]
+    twins: Float[np.ndarray, " p"]  # how many directions of the circle each azimuth stands for
+
+    @classmethod
+    def of(cls, block: Block, rows: np.ndarray, columns: np.ndarray, floor: float) -> "_Seen":
+        """See a block among the rows and columns of a fit."""
+        function = [_functions(angle, block.theta_o, block.phi_o, floor) for angle in block.theta_i]
+        twins = np.where(np.isclose(block.phi_o, np.pi), 1.0, 2.0)
+        places = (np.searchsorted(axis, own) for axis, own in ((rows, block.theta_i), (columns, block.theta_o)))
+        return cls(*places, np.stack(function), twins)
 
 
 def _functions(theta_i, theta_o, phi_o, floor) -> Float[np.ndarray, "o p function"]:

@@ -35,7 +35,9 @@ def grow(
         projection = fit.project(factors[2])
         core, gain = fit.solve_core(*factors[:2], projection)
         error = energy - gain[:channels].sum()
-        if error <= NO_ERROR * energy or is_enough(Factors(*factors, core[..., :channels])):
+        found = Factors(*factors, core[..., :channels])
+        enough = is_enough(found)
+        if error <= NO_ERROR * energy or enough:
             break
         held = numbers(*[f.shape[1] for f in factors], channels)
         steps = []  # score, the error taken away, what it leads to
@@ -59,7 +61,8 @@ def grow(
             break
         factors, channels = fit.sweep(wider, wider_channels)[0], wider_channels
     factors = _settle(fit, factors, channels)
-    return Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2]))[0][..., :channels])
+    settled = Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2]))[0][..., :channels])
+    return found if enough and not is_enough(settled) else settled  # settled for all, not for the worst
 
 
 def _settle(fit: TensorFit, factors, channels: int) -> list[np.ndarray]:
