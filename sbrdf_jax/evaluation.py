@@ -27,6 +27,7 @@ from sbrdf_jax.resampling.guided.field import (
     each_direction,
     evaluate_direction,
     evaluate_with_error,
+    evaluated_part,
     field_whitener,
 )
 from sbrdf_jax.resampling.guided.field import evaluate_on_axes as field_on_axes
@@ -290,7 +291,7 @@ def evaluate_standard_error(
         raise TypeError(f"{type(result).__name__}: its method has no standard error")
     angles = np.broadcast_arrays(*(np.asarray(a, float) for a in (theta_i, theta_o, phi_o)))
     whiten = jnp.asarray(field_whitener(field))
-    _, *found = evaluate_with_error(field, whiten, *(jnp.asarray(a.reshape(-1)) for a in angles))
+    _, *found = evaluate_with_error(evaluated_part(field), whiten, *(jnp.asarray(a.reshape(-1)) for a in angles))
     both = np.asarray(found).reshape(2, *angles[0].shape, -1)
     if wavelength_nm is not None:
         measured = np.asarray(field.wavelength_nm)
@@ -306,8 +307,10 @@ def on_device(result: Any) -> Any:
     if isinstance(result, LobeHarmonics):
         result = pad_coefficients(result)
     if isinstance(result, GriddedBRDF):
-        more = {} if result.field is None else {"brdf": None}
+        more = {} if result.field is None else {"brdf": None, "field": evaluated_part(result.field)}
         result = dataclasses.replace(result, **dict.fromkeys(NEVER_EVALUATED), **more)
+    if isinstance(result, GuidedField):
+        result = evaluated_part(result)
     return jax.tree.map(jnp.asarray, result)
 
 

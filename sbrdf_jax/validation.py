@@ -22,7 +22,7 @@ from sbrdf_jax.options import ResampleOptions
 from sbrdf_jax.records import RawSamples
 from sbrdf_jax.resampling import resample
 from sbrdf_jax.resampling.guided import Centres, fit_field, place_centres
-from sbrdf_jax.resampling.guided.field import evaluate_with_error
+from sbrdf_jax.resampling.guided.field import evaluate_with_error, evaluated_part
 from sbrdf_jax.scores import coverage, coverage_by, held_out_scores, scores_by_half_angle
 
 
@@ -72,7 +72,8 @@ def predict(
     angles = theta_i, theta_o, phi_o
     if options.method == "guided":
         fit = fit_field(train, options, report, None if centres is None else centres.take(train.row))
-        value, error, noise = evaluate_with_error(fit.field, jnp.asarray(fit.whiten), *map(jnp.asarray, angles))
+        field, whiten = evaluated_part(fit.field), jnp.asarray(fit.whiten)
+        value, error, noise = evaluate_with_error(field, whiten, *map(jnp.asarray, angles))
         return Prediction(np.asarray(value), fit.status, np.hypot(error, noise))
     gridded = resample(train, grid, options, report)
     return Prediction(evaluate_in_chunks(gridded, *angles), np.asarray(gridded.status, int))

@@ -49,6 +49,7 @@ from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value, lo
 from sbrdf_jax.resampling.guided.merging import merge_samples
 from sbrdf_jax.resampling.guided.nodes import GRIDS, interpolate, mirror, mode_variance
 from sbrdf_jax.resampling.guided.smoothing import CONSTANT, PRIOR
+from sbrdf_jax.runtime import compile_clock
 from sbrdf_jax.scores import coverage, held_out_scores
 from sbrdf_jax.store import load, load_stage
 from sbrdf_jax.validation import predict_held_out
@@ -278,6 +279,16 @@ def test_values_along_axes_are_those_of_the_directions(field):
     found = evaluate_where(field, *axes, where)
     np.testing.assert_allclose(found, evaluate_in_chunks(field, *(a[where] for a in mesh)), rtol=1e-9, atol=1e-13)
     assert evaluate_where(field, *axes, np.zeros_like(where)).shape == (0, np.size(field.wavelength_nm))
+
+
+def test_a_material_with_another_curve_compiles_nothing(field):
+    """How many smoothings were tried differs from material to material, and evaluation does not read it."""
+    angles = np.full(3, 0.4), np.full(3, 0.5), np.full(3, 2.0)
+    other = dataclasses.replace(field, curve=np.ones((2, 1 + np.shape(field.curve)[1])))
+    evaluate_in_chunks(field, *angles), evaluate_on_axes(field, *angles), evaluate_standard_error(field, *angles)
+    with compile_clock() as clock:
+        evaluate_in_chunks(other, *angles), evaluate_on_axes(other, *angles), evaluate_standard_error(other, *angles)
+    assert clock.num_compiled == 0
 
 
 def test_field_is_near_the_truth_and_errors_are_calibrated(field, rng):

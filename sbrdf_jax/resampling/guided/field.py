@@ -1,5 +1,6 @@
 """The fitted field and its evaluation: lobe model plus the residual of two grids, in the generalised logarithm."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -34,6 +35,7 @@ DIRECTIONS_AT_A_TIME = 1024
 WHITEN_BLOCK = 256  # rows of a triangular matrix that are multiplied as one full block
 MOST_GATHERED = 8  # wavelengths; measured: 1.8 us a direction against 6.1 for 1, 5.0 and 7.4 for 6, 46 and 16 for 31
 
+NEVER_EVALUATED = ("multiplier", "model_residual", "reciprocity_cost", "curve")
 LAST_AXIS = ("wavelength_nm", "half", "azimuth", "multiplier", "model_residual")  # is the wavelength's, in a field
 
 
@@ -71,6 +73,11 @@ class GuidedField:
     reciprocity_cost: Any  # left-out errors with nodes tied by reciprocity over those without; 1 where not tied
     curve: Any  # [2, trial] noise and left-out error of z
     measured: MeasuredLobe
+
+
+def evaluated_part(field: GuidedField) -> GuidedField:
+    """Return what evaluation and standard errors read: the rest differs in shape from material to material."""
+    return dataclasses.replace(field, **dict.fromkeys(NEVER_EVALUATED))
 
 
 @jax.jit

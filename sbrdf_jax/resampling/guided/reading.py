@@ -13,7 +13,7 @@ from sbrdf_jax.grid import Grid
 from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.records import GriddedBRDF
 from sbrdf_jax.resampling.guided.covariance import covariance_on_axes
-from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_on_axes_with_error
+from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_on_axes_with_error, evaluated_part
 from sbrdf_jax.resampling.guided.lanes import take_field
 from sbrdf_jax.resampling.guided.on_axes import on_axes
 
@@ -63,7 +63,8 @@ def read_nodes(
         rows = np.flatnonzero(nodes.any(axis=(1, 2)))
         if not len(columns) or not len(rows):
             continue
-        part = jax.tree.map(jnp.asarray, field if len(columns) == len(lanes) else take_field(field, columns))
+        part = evaluated_part(field if len(columns) == len(lanes) else take_field(field, columns))
+        part = jax.tree.map(jnp.asarray, part)
         for i in rows:
             found = on_axes(_row(evaluate_on_axes_with_error, part, grid.theta_i[i]), *axes, nodes[i], variance[i])
             for out, new in zip(value[:, i], found, strict=True):
