@@ -355,7 +355,8 @@ def evaluate_where(
 
     As `evaluate_on_axes` where a record gains by it; what is around the mask is then evaluated too.
     """
-    result, field = on_device(result), getattr(result, "field", result)
+    result = on_device(result)
+    field = getattr(result, "field", result)
     axes = [np.asarray(a, float) for a in (theta_i, theta_o, phi_o)]
     if isinstance(result, GriddedBRDF) and field is None:
         return evaluate_on_axes(result, *axes)[where]
@@ -363,7 +364,7 @@ def evaluate_where(
         directions = (mesh[where] for mesh in np.meshgrid(*axes, indexing="ij"))
         return evaluate_in_chunks(result, *directions, chunk_size=chunk_size)
     nodes = None if getattr(result, "interpolate_theta_i", True) else np.asarray(result.theta_i)
-    field, value = getattr(result, "field", result), []
+    value: list[np.ndarray] = []
     for i in np.flatnonzero(where.any(axis=(1, 2))):
         angle = axes[0][i] if nodes is None else nodes[np.argmin(np.abs(axes[0][i] - nodes))]
         row = functools.partial(field_on_axes, field, angle)

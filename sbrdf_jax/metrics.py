@@ -198,11 +198,11 @@ def error_between(compact: CompactBRDF | LobeHarmonics | LobeTensor, gridded: Gr
     live, cell = live_wavelengths(gridded), cells_between(needed_nodes(gridded))
 
     def at(theta_i, cells):
-        errors = np.full(len(cells), np.nan)
-        axes, some = (theta_i[cells.any(axis=(1, 2))], theta_o, phi_o), cells[cells.any(axis=(1, 2))]
-        pairs = zip(slices(gridded, *axes, some), slices(compact, *axes, some), strict=True)
+        errors, counts = np.full(len(cells), np.nan), cells.any(axis=(1, 2))
+        given = theta_i[counts], theta_o, phi_o, cells[counts]
+        pairs = zip(slices(gridded, *given), slices(compact, *given), strict=True)
         sums = [(((got - want[:, live]) ** 2).sum(), (want[:, live] ** 2).sum()) for want, got in pairs]
-        errors[cells.any(axis=(1, 2))] = [relative_error(*pair) for pair in sums]
+        errors[counts] = [relative_error(*pair) for pair in sums]
         return errors
 
     both = cell[:-1] & cell[1:] if gridded.interpolate_theta_i else np.zeros_like(cell[:-1])

@@ -206,9 +206,7 @@ def _log_value_on_axes(field: GuidedField, theta_i, theta_o, phi_o) -> tuple[Coo
     for name, (axis, axis_i, axis_o) in GRIDS.items():
         nodes = jnp.asarray(getattr(field, name))
         first, weight = cubic_weights(at.theta_i[0, 0], axis_i)
-        nodes = jnp.tensordot(
-            weight, jax.lax.dynamic_slice_in_dim(nodes, first, 4, 1), (0, 1)
-        )  # [first, o, wavelength]
-        nodes = jnp.tensordot(cubic_matrix(at.theta_o[:, 0], axis_o), nodes, (1, 1))
+        nodes = jnp.tensordot(weight, jax.lax.dynamic_slice_in_dim(nodes, first, 4, 1), (0, 1))
+        nodes = jnp.tensordot(cubic_matrix(at.theta_o[:, 0], axis_o), nodes, (1, 1))  # [o, first node, wavelength]
         z = z + cubic_matrix(getattr(at, name), axis) @ nodes
     return at, z

@@ -1,7 +1,7 @@
 """The fitted field and its standard error, read off at the nodes of a grid that are needed."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -66,19 +66,14 @@ def read_nodes(
         part = evaluated_part(field if len(columns) == len(lanes) else take_field(field, columns))
         part = jax.tree.map(jnp.asarray, part)
         for i in rows:
-            found = on_axes(_row(evaluate_on_axes_with_error, part, grid.theta_i[i]), *axes, nodes[i], variance[i])
-            for out, new in zip(value[:, i], found, strict=True):
-                place = np.nonzero(nodes[i])
-                out[place[0][:, None], place[1][:, None], columns] = new
+            at_i = functools.partial(evaluate_on_axes_with_error, part, grid.theta_i[i])
+            o, p = (place[:, None] for place in np.nonzero(nodes[i]))
+            for out, new in zip(value[:, i], on_axes(at_i, *axes, nodes[i], variance[i]), strict=True):
+                out[o, p, columns] = new
     around, rows = np.append(grid.azimuth_index, 0), half.any(axis=(1, 2))
     known_variance = np.where(half, variance, np.nan)[rows][:, :, around]
     value = value[:, rows][:, :, :, around]
     return NodeValues(value[0], value[1], known_variance)
-
-
-def _row(function: Callable[..., Any], field: Any, theta_i: float) -> Callable[..., Any]:
-    """Return a function of a field at one incident angle as one of two axes, and of arrays over them."""
-    return lambda theta_o, phi_o, *arrays: function(field, theta_i, theta_o, phi_o, *arrays)
 
 
 def _add_variances(variance: np.ndarray, missing: np.ndarray, field: GuidedField, whiten, theta_i, axes) -> None:
@@ -91,7 +86,7 @@ def _add_variances(variance: np.ndarray, missing: np.ndarray, field: GuidedField
     distinct[isotropic] = False
     distinct[..., 0] |= isotropic & missing.any(axis=2)
     for i in np.flatnonzero(distinct.any(axis=(1, 2))):
-        pending.append(on_axes(lambda *a, i=i: covariance_on_axes(*prior, theta_i[i], *a), *axes, distinct[i]))
+        pending.append(on_axes(functools.partial(covariance_on_axes, *prior, theta_i[i]), *axes, distinct[i]))
         if sum(len(part[1]) for part in pending) >= MOST_PENDING:
             flushed.append(_unexplained(pending, whiten))
             pending = []
