@@ -47,7 +47,7 @@ def read_earlier(
     except UserError as error:
         raise UserError(f"runtime.resume_from: {error}") from None
     ours, theirs = versions(), result.versions
-    same_code = all(ours.get(name) == theirs.get(name) for name in ("sbrdf_jax", "jax", "numpy"))
+    same_code = all(ours[name] == theirs.get(name) for name in ("sbrdf-jax", "jax", "numpy"))
     same_source = result.source_sha256 == raw.source_sha256 != ""
     if not (same_code and same_source and _of_grid(made_with) == _of_grid(options)):
         return None

@@ -8,14 +8,17 @@ from problems import scattered_samples
 
 import sbrdf_jax.pipeline
 import sbrdf_jax.resampling.guided as guided
+from sbrdf_jax import reuse
 from sbrdf_jax.cli import main
 from sbrdf_jax.config import parse_config, resolve
-from sbrdf_jax.formats import write_samples
+from sbrdf_jax.formats import read, write_samples
 from sbrdf_jax.grid import make_grid
 from sbrdf_jax.masks import write_footprint
 from sbrdf_jax.needs import everything
 from sbrdf_jax.options import GridOptions, ResampleOptions
+from sbrdf_jax.pipeline import prepare
 from sbrdf_jax.resampling import resample
+from sbrdf_jax.runtime import versions
 from sbrdf_jax.store import load
 
 GRID = ["grid.theta_i_step_deg=22.5", "grid.theta_o_step_deg=22.5", "grid.phi_o_step_deg=45", "output.report=false"]
@@ -178,6 +181,18 @@ def test_what_cannot_be_reused_is_said(folder, capsys, solved):
     assert main(command(folder, "none.h5", earlier="nowhere.h5")) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "runtime.resume_from" in error and "no such file" in error
+
+
+@pytest.mark.parametrize("package", ["sbrdf-jax", "jax", "numpy"])
+def test_what_other_code_has_computed_is_not_reused(folder, monkeypatch, package):
+    path = folder / "some.h5"
+    options = resolve(parse_config(load(path).config))
+    raw = read(options.input.path, options.input)
+    ready = prepare(raw, options)
+    assert reuse.read_earlier(str(path), raw, options, ready.needs, ready.folds) is not None
+    other = versions() | {package: "0.0"}
+    monkeypatch.setattr(reuse, "versions", lambda: other)
+    assert reuse.read_earlier(str(path), raw, options, ready.needs, ready.folds) is None
 
 
 def load_wavelengths(folder) -> np.ndarray:
