@@ -1,4 +1,4 @@
-"""Lanes on all devices of the process: each device takes its share of them, and no lane knows of it."""
+"""Where work is done: lanes on all devices of the process, and on the host what a processor does as well uncompiled."""
 
 import functools
 from collections.abc import Callable
@@ -11,6 +11,24 @@ from jax.extend.core import jaxpr_as_fun
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 AXIS = "lanes"
+
+
+@functools.cache
+def on_host(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of `array_module`'s kind that NumPy computes where the processor is all that JAX has.
+
+    There compiling it would take longer than computing it; on an accelerator it is `jax.jit` of the function.
+    Arguments are arrays, or trees of them, of NumPy or JAX.
+    """
+    compiled = jax.jit(function)
+
+    @functools.wraps(function)
+    def call(*arguments: Any) -> Any:
+        if jax.default_backend() != "cpu":
+            return compiled(*arguments)
+        return function(*jax.tree.map(np.asarray, arguments))
+
+    return call
 
 
 def over_lanes(

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Real
 
+from sbrdf_jax.devices import on_host
 from sbrdf_jax.encoding import decode
 from sbrdf_jax.interpolation import outside_range, spectral_weights
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, SpectralField
@@ -355,7 +356,6 @@ def evaluate_where(
 
     As `evaluate_on_axes` where a record gains by it; what is around the mask is then evaluated too.
     """
-    result = on_device(result)
     field = getattr(result, "field", result)
     axes = [np.asarray(a, float) for a in (theta_i, theta_o, phi_o)]
     if isinstance(result, GriddedBRDF) and field is None:
@@ -365,9 +365,10 @@ def evaluate_where(
         return evaluate_in_chunks(result, *directions, chunk_size=chunk_size)
     nodes = None if getattr(result, "interpolate_theta_i", True) else np.asarray(result.theta_i)
     value: list[np.ndarray] = []
+    field = evaluated_part(field)
     for i in np.flatnonzero(where.any(axis=(1, 2))):
         angle = axes[0][i] if nodes is None else nodes[np.argmin(np.abs(axes[0][i] - nodes))]
-        row = functools.partial(field_on_axes, field, angle)
+        row = functools.partial(on_host(field_on_axes), field, angle)
         value += on_axes(lambda *at, row=row: (row(*at),), *axes[1:], where[i])
     return np.concatenate(value)
 

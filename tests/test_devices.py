@@ -64,9 +64,9 @@ from sbrdf_jax.resampling.guided.bounds import solve_bounded
 rng = np.random.default_rng(5)
 matrix, target = rng.standard_normal((60, 40)), rng.standard_normal((60, 6))
 target[3, 2] = np.nan
-method, eye = ProjectedNewton(tolerance=1e-10), jnp.eye(40)
+method = ProjectedNewton(tolerance=1e-10)
 normal, rhs = DenseNormal(jnp.asarray(matrix.T @ matrix)), jnp.asarray(matrix.T @ target)
-prior, residual = jnp.asarray(matrix.T @ matrix / 60), jnp.asarray(rng.standard_normal((40, 6)))
+prior, residual = matrix.T @ matrix / 60, rng.standard_normal((40, 6))
 exponent = rng.uniform(0, 3, (6, 30))
 lobe = 2 * np.exp(-exponent / 0.4), np.ones((6, 30), bool), exponent, np.ones(30), (np.ones(6), np.full(6, 0.2))
 
@@ -77,7 +77,7 @@ def solve():
     what = "many rounds"
     yield solve_in_rounds(normal, rhs, ProjectedNewton(tolerance=1e-30, max_steps=250))
     what = "bounded"
-    yield solve_bounded(prior, jnp.linalg.inv(prior + eye), jnp.ones(40), residual, 0 * residual - 0.3, method)
+    yield solve_bounded(prior, np.linalg.inv(prior + np.eye(40)), np.ones(40), residual, 0 * residual - 0.3, method)
 
 four = list(solve())
 looked = len(seen)
@@ -85,7 +85,7 @@ with jax.default_device(jax.devices()[0]):
     one = list(solve())
 assert len(seen) == looked
 for few, many in zip(jax.tree.leaves(one), jax.tree.leaves(four), strict=True):
-    assert many.sharding.device_set == {{jax.devices()[0]}}
+    assert isinstance(many, np.ndarray) or many.sharding.device_set == {{jax.devices()[0]}}
     size = np.max(np.abs(few), where=np.isfinite(few), initial=1.0)  # a residual is relative to 1
     np.testing.assert_allclose(many, few, rtol=0, atol=1e-10 * size)
 what = "lobes"

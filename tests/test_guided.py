@@ -167,7 +167,7 @@ def test_covariance_and_nodes_equal_dense_matrices(rng, reciprocal):
     np.testing.assert_allclose(prior_variance(variance, at), own, rtol=1e-10)
     theta_o, phi_o = jnp.asarray([0.0, 0.4, 1.2]), jnp.asarray([0.0, 1.0, np.pi])
     limit, centre = jnp.asarray(centres.theta_limit), jnp.asarray(centres.angles.reshape(3, 3, -1))
-    along, along_prior = covariance_on_axes(variance, centre, limit, 0.3, theta_o, phi_o)
+    along, along_prior = covariance_on_axes(variance, centre, limit, jnp.asarray(0.3), theta_o, phi_o)
     mesh = coordinates_on_axes(jnp.asarray(0.3), theta_o, phi_o, limit)
     np.testing.assert_allclose(
         along.reshape(9, -1), covariance(variance, flatten(mesh), centres.features), rtol=1e-10, atol=1e-14
@@ -210,34 +210,35 @@ def test_leave_group_out_equals_refits(rng):
     assert not out[group == -1].any()
 
 
-def test_bounded_answer_equals_scipys(rng):
+@pytest.mark.parametrize("raised", [0.0, 10.0])  # by 10 the unbounded answer keeps the bound, and nothing is solved
+def test_bounded_answer_equals_scipys(rng, raised):
     """Against min |N^-1/2 (z - data)|^2 + (z - model)' K^-1 (z - model), z >= 0, stated in z itself."""
-    prior, noise, residual = random_problem(rng)
-    prior, noise = prior + 0.1 * jnp.eye(40), 10 * noise
-    model = jnp.asarray(rng.uniform(0, 0.3, residual.shape))
-    inverse = jnp.asarray(mirror_lower(lower_inverse(np.asarray(prior), np.asarray(noise))))
+    prior, noise, residual = (np.asarray(a) for a in random_problem(rng))
+    prior, noise, model = prior + 0.1 * np.eye(40), 10 * noise, rng.uniform(0, 0.3, residual.shape) + raised
+    inverse = mirror_lower(lower_inverse(prior, noise))
     found = solve_bounded(prior, inverse, noise, residual, model, ProjectedNewton(tolerance=1e-10))
-    z = np.asarray(model + prior @ found.dual)
-    assert (z > -1e-9).all() and (z < 1e-9).sum() > 5 and float(found.kkt_residual.max()) <= 1e-10
-    root = np.linalg.inv(np.linalg.cholesky(np.asarray(prior)))
-    rows = np.concatenate([np.diag(1 / np.sqrt(np.asarray(noise))), root])
+    z = model + prior @ found.dual
+    assert (z > -1e-9).all() and (z < 1e-9).any() == (raised == 0) == found.multiplier.any()
+    assert found.kkt_residual.max() <= 1e-10 and (found.status == Status.OK).all()
+    root = np.linalg.inv(np.linalg.cholesky(prior))
+    rows = np.concatenate([np.diag(1 / np.sqrt(noise)), root])
     for lane in range(z.shape[1]):
-        data = np.asarray(model + residual)[:, lane] / np.sqrt(np.asarray(noise))
-        expected, _ = scipy.optimize.nnls(rows, np.concatenate([data, root @ np.asarray(model)[:, lane]]))
+        data = (model + residual)[:, lane] / np.sqrt(noise)
+        expected, _ = scipy.optimize.nnls(rows, np.concatenate([data, root @ model[:, lane]]))
         np.testing.assert_allclose(z[:, lane], expected, atol=1e-7)
 
 
 def test_lobe_model_recovers_planted_amplitudes(rng):
     num = 400
     theta_i, theta_o, phi = rng.uniform(0.1, 1.3, num), rng.uniform(0, 1.3, num), np.pi * np.sqrt(rng.random(num))
-    at = guided_coordinates(*(jnp.asarray(x) for x in (theta_i, theta_o, phi)), LIMIT)
+    at = guided_coordinates(theta_i, theta_o, phi, np.asarray(LIMIT))
     shape = np.array([-0.7, np.log(0.0105), np.log(0.08), np.log(0.3), 1.0, 1.0, 0.8, 0.9, 0.5])
-    planted = LobeModel(jnp.asarray(shape), jnp.asarray(np.log([[0.1, 0.05], [1.0, 1.0], [2.0, 2.0], [0.2, 0.4]])))
+    planted = LobeModel(shape, np.log([[0.1, 0.05], [1.0, 1.0], [2.0, 2.0], [0.2, 0.4]]))
     floor = 1e-3
-    z = np.asarray(lobe_log_value(planted, at, jnp.asarray(floor)))
-    value = np.asarray(from_log(jnp.asarray(z), log_scale(at, jnp.asarray(floor))))
+    z = lobe_log_value(planted, at, floor)
+    value = from_log(z, log_scale(at, floor))
     found, gradient = fit_lobe_model(value, z, at, np.ones(num), floor)
-    assert np.sqrt(np.mean((np.asarray(lobe_log_value(found, at, jnp.asarray(floor))) - z) ** 2)) < 0.02
+    assert np.sqrt(np.mean((lobe_log_value(found, at, floor) - z) ** 2)) < 0.02
     assert gradient.shape == (2,) and float(gradient.max()) < 0.2
 
 

@@ -6,6 +6,7 @@ grids, for all wavelengths at once; everything that depends on angles alone is s
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -177,13 +178,14 @@ def describe_fit(field: GuidedField) -> tuple[str, ...]:
 
 def describe_spike(field: GuidedField) -> list[str]:
     """Say where the mirror image of the source outshines all else, and too few directions see it to tell its shape."""
-    angle = jnp.asarray(SPIKE_THETA)
-    at = guided_coordinates(angle, angle, jnp.asarray(np.pi), jnp.asarray(field.theta_limit))
-    term = np.asarray(lobe_terms(jnp.asarray(field.lobe.shape), at))[:, None] * np.exp(field.lobe.log_amplitude)
+    field = jax.tree.map(np.asarray, field)
+    angle = np.asarray(SPIKE_THETA)
+    at = guided_coordinates(angle, angle, np.asarray(np.pi), field.theta_limit)
+    term = lobe_terms(field.lobe.shape, at)[:, None] * np.exp(field.lobe.log_amplitude)
     spiky = term[MIRROR_TERM] > np.delete(term, MIRROR_TERM, axis=0).sum(axis=0)
     width = np.rad2deg(np.arctan(np.exp(field.lobe.shape[1])))
-    centres = guided_coordinates(*(jnp.asarray(a) for a in field.centre), jnp.asarray(field.theta_limit))
-    near = (np.expm1(np.asarray(centres.half)) < width) & (np.asarray(field.noise) < PADDING_NOISE)
+    centres = guided_coordinates(*field.centre, field.theta_limit)
+    near = (np.expm1(centres.half) < width) & (field.noise < PADDING_NOISE)
     if not spiky.any() or near.sum() >= RESOLVED * len(near):
         return []
     return [

@@ -7,15 +7,14 @@ G = N - N (K + N)^-1 N the posterior covariance at the centres, well conditioned
 nodes' own normal matrix is not.
 """
 
-import functools
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
 from sbrdf_jax.devices import over_lanes
-from sbrdf_jax.nnls import DenseNormal, ProjectedNewton, solve_nnls
+from sbrdf_jax.host_blas import one_blas_thread
+from sbrdf_jax.nnls import DenseNormal, NNLSResult, ProjectedNewton, solve_nnls
 from sbrdf_jax.records import Status
 from sbrdf_jax.resampling.guided.centres import PADDING_NOISE
 
@@ -23,23 +22,24 @@ from sbrdf_jax.resampling.guided.centres import PADDING_NOISE
 class Bounded(NamedTuple):
     """The bounded answer at the centres, and what proves it."""
 
-    dual: jax.Array  # [centre, wavelength] (K + N)^-1 (r + N v)
-    multiplier: jax.Array  # [centre, wavelength] N^1/2 v
-    kkt_residual: jax.Array  # [wavelength] of the bounded problem, and of the linear system under it
-    num_steps: jax.Array  # [wavelength]
-    status: jax.Array  # [wavelength]
+    dual: np.ndarray  # [centre, wavelength] (K + N)^-1 (r + N v)
+    multiplier: np.ndarray  # [centre, wavelength] N^1/2 v
+    kkt_residual: np.ndarray  # [wavelength] of the bounded problem, and of the linear system under it
+    num_steps: np.ndarray  # [wavelength]
+    status: np.ndarray  # [wavelength]
 
 
-@functools.partial(over_lanes, axis=-1, shared=(0, 1, 2), static=(5,))
 def solve_bounded(
-    prior: Float[Array, "centre centre"],
-    inverse: Float[Array, "centre centre"],
-    noise: Float[Array, " centre"],
-    residual: Float[Array, "centre wavelength"],
-    model: Float[Array, "centre wavelength"],
+    prior: Float[np.ndarray, "centre centre"],
+    inverse: Float[np.ndarray, "centre centre"],
+    noise: Float[np.ndarray, " centre"],
+    residual: Float[np.ndarray, "centre wavelength"],
+    model: Float[np.ndarray, "centre wavelength"],
     method: ProjectedNewton,
 ) -> Bounded:
     """Solve for the dual coefficients of the field with z >= 0 at the centres.
+
+    Where the unbounded answer keeps the bound at every wavelength it is the answer, and no solver is compiled.
 
     Args:
         prior: K, the prior covariance.
@@ -49,18 +49,28 @@ def solve_bounded(
         model: z of the lobe model.
         method: The solver and its tolerance on the relative KKT residual.
     """
+    lanes = residual.shape[1]
     is_bound = noise < PADDING_NOISE
-    root = jnp.where(is_bound, jnp.sqrt(noise), 0.0)
-    covariance = jnp.eye(len(root)) - root[:, None] * inverse * root[None, :]
-    free = inverse @ residual
-    unbounded = model + residual - (root**2)[:, None] * free
-    rhs = jnp.where(is_bound[:, None], -unbounded / jnp.where(is_bound, root, 1.0)[:, None], 0.0)
-    found = solve_nnls(DenseNormal(covariance), rhs, method)
-    raised = residual + root[:, None] * found.value
-    dual = inverse @ raised
-    # what the linear system is left with, beside what the bound is left with
-    misfit = jnp.max(jnp.abs(prior @ dual + noise[:, None] * dual - raised), axis=0)
-    size = jnp.max(jnp.abs(raised), axis=0)
-    kkt_residual = jnp.maximum(found.residual, misfit / jnp.where(size > 0, size, 1.0))
-    status = jnp.where(kkt_residual <= method.tolerance, found.status, jnp.maximum(found.status, int(Status.MAX_STEPS)))
+    root = np.where(is_bound, np.sqrt(noise), 0.0)
+    with one_blas_thread():
+        unbounded = model + residual - (root**2)[:, None] * (inverse @ residual)
+        found = NNLSResult(np.zeros_like(residual), *np.zeros((2, lanes), int), np.zeros(lanes))
+        if not np.all(unbounded[is_bound] >= 0):
+            covariance = np.eye(len(root)) - root[:, None] * inverse * root[None, :]
+            rhs = np.where(is_bound[:, None], -unbounded / np.where(is_bound, root, 1.0)[:, None], 0.0)
+            found = NNLSResult(*map(np.asarray, _solve_lanes(covariance, rhs, method)))
+        raised = residual + root[:, None] * found.value
+        dual = inverse @ raised
+        # what the linear system is left with, beside what the bound is left with
+        misfit = np.abs(prior @ dual + noise[:, None] * dual - raised).max(axis=0)
+    size = np.abs(raised).max(axis=0)
+    kkt_residual = np.maximum(found.residual, misfit / np.where(size > 0, size, 1.0))
+    status = np.where(kkt_residual <= method.tolerance, found.status, np.maximum(found.status, int(Status.MAX_STEPS)))
     return Bounded(dual, found.value, kkt_residual, found.num_steps, status)
+
+
+def _solve_lanes_on_one_device(covariance, rhs, method: ProjectedNewton) -> NNLSResult:
+    return solve_nnls(DenseNormal(covariance), rhs, method)
+
+
+_solve_lanes = over_lanes(_solve_lanes_on_one_device, axis=-1, shared=(0,), static=(2,))

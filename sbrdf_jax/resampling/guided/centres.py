@@ -2,13 +2,12 @@
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
 from sbrdf_jax.angles import fold_azimuth
 from sbrdf_jax.coverage import cluster_incidences
+from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.records import RawSamples
 from sbrdf_jax.resampling.guided.coordinates import EXTRAPOLATION, Coordinates, guided_coordinates
 from sbrdf_jax.resampling.guided.covariance import (
@@ -40,7 +39,7 @@ class Centres:
     theta_limit: np.ndarray  # [2] rad
     features: GroupedFeatures
     reciprocal: bool  # nodes are tied by Helmholtz reciprocity
-    _prior: dict[int, tuple[ModeVariance, jax.Array]] = dataclasses.field(default_factory=dict)
+    _prior: dict[int, tuple[ModeVariance, np.ndarray]] = dataclasses.field(default_factory=dict)
     _inverse: dict[tuple[int, float], np.ndarray] = dataclasses.field(default_factory=dict)
 
     @property
@@ -58,17 +57,18 @@ class Centres:
         """Centres of each group, padding included."""
         return self.count // self.num_groups
 
-    def prior(self, variance: ModeVariance) -> jax.Array:
+    def prior(self, variance: ModeVariance) -> np.ndarray:
         """Prior covariance [centre, centre], computed once for each smoothness."""
         if id(variance) not in self._prior:
-            self._prior[id(variance)] = variance, covariance(variance, self.snapped, self.features)
+            with one_blas_thread():
+                self._prior[id(variance)] = variance, covariance(variance, self.snapped, self.features)
         return self._prior[id(variance)][1]
 
     def lower_inverse(self, variance: ModeVariance, level: float) -> np.ndarray:
         """Lower triangle of the inverse of prior plus noise, no direction doubted; computed once for each pair."""
         key = id(variance), level
         if key not in self._inverse:
-            self._inverse[key] = lower_inverse(np.asarray(self.prior(variance)), self.noise(level))
+            self._inverse[key] = lower_inverse(self.prior(variance), self.noise(level))
         return self._inverse[key]
 
     def noise(self, level: float) -> np.ndarray:
@@ -100,7 +100,7 @@ def place_centres(samples: RawSamples, reciprocal: bool = False) -> Centres:
         measured[:] = measured.max()
     limit = np.minimum(measured + EXTRAPOLATION, STEEPEST)
     azimuth = fold_azimuth(phi_o)
-    half = np.asarray(guided_coordinates(*map(jnp.asarray, (theta_i, theta_o, azimuth, limit))).half)
+    half = guided_coordinates(theta_i, theta_o, azimuth, limit).half
     group_of_sample = group_incidences(theta_i)
     cell = merge_samples(group_of_sample, theta_o, azimuth, half)
     mean = [np.bincount(cell, x) / np.bincount(cell) for x in (theta_i, theta_o, azimuth)]
@@ -112,11 +112,11 @@ def place_centres(samples: RawSamples, reciprocal: bool = False) -> Centres:
     angles = np.full((3, groups * members), 0.5)
     angles[0] = np.repeat(incidence, members)
     angles[:, position] = mean
-    grouped = group_coordinates(jnp.asarray(angles.reshape(3, groups, members)), jnp.asarray(limit))
+    grouped = group_coordinates(angles.reshape(3, groups, members), limit)
     return Centres(
         row=samples.row,
         index=position[cell],
-        at=guided_coordinates(*(jnp.asarray(a) for a in angles), jnp.asarray(limit)),
+        at=guided_coordinates(*angles, limit),
         snapped=flatten(grouped),
         angles=angles,
         theta_limit=limit,

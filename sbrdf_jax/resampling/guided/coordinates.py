@@ -8,12 +8,11 @@ pole the azimuth is compressed to a constant, so that the field is exactly isotr
 import dataclasses
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from sbrdf_jax.angles import fold_azimuth
+from sbrdf_jax.array_module import AnyArray, array_module
 from sbrdf_jax.records import pytree
 
 COS_FLOOR = float(np.cos(np.deg2rad(85.0)))  # every cosine that divides or weighs is at least this
@@ -35,12 +34,11 @@ class Coordinates:
     cos_difference: Any  # cosine of the angle between half vector and incidence
 
 
-@jax.jit
 def guided_coordinates(
-    theta_i: Float[Array, "*shape"],
-    theta_o: Float[Array, "*shape"],
-    phi_o: Float[Array, "*shape"],
-    theta_limit: Float[Array, " 2"],
+    theta_i: Float[AnyArray, "*shape"],
+    theta_o: Float[AnyArray, "*shape"],
+    phi_o: Float[AnyArray, "*shape"],
+    theta_limit: Float[AnyArray, " 2"],
 ) -> Coordinates:
     """Return the guided method's coordinates of directions.
 
@@ -53,30 +51,34 @@ def guided_coordinates(
         phi_o: Outgoing azimuth [rad]; the mirror direction is at pi.
         theta_limit: Largest theta_i and theta_o [rad]; angles beyond are clamped to it.
     """
-    theta_i = jnp.clip(theta_i, 0.0, theta_limit[0])
-    theta_o = jnp.clip(theta_o, 0.0, theta_limit[1])
+    xp = array_module(theta_i, theta_o, phi_o, theta_limit)
+    theta_i = xp.clip(theta_i, 0.0, theta_limit[0])
+    theta_o = xp.clip(theta_o, 0.0, theta_limit[1])
     azimuth = fold_azimuth(phi_o)
-    sin_i, sin_o = jnp.sin(theta_i), jnp.sin(theta_o)
+    sin_i, sin_o = xp.sin(theta_i), xp.sin(theta_o)
     # |tangential part|^2 as a sum of squares that vanishes exactly at the mirror direction
-    tangential2 = (sin_i - sin_o) ** 2 + 4 * sin_i * sin_o * jnp.cos(azimuth / 2) ** 2
-    normal = jnp.cos(theta_i) + jnp.cos(theta_o)
-    theta_h = jnp.arctan2(jnp.sqrt(tangential2 + 1e-24), normal)
-    cos_difference = jnp.sqrt(tangential2 + normal**2) / 2
+    tangential2 = (sin_i - sin_o) ** 2 + 4 * sin_i * sin_o * xp.cos(azimuth / 2) ** 2
+    normal = xp.cos(theta_i) + xp.cos(theta_o)
+    theta_h = xp.arctan2(xp.sqrt(tangential2 + 1e-24), normal)
+    cos_difference = xp.sqrt(tangential2 + normal**2) / 2
     blend = sin_i * sin_o / (sin_i * sin_o + POLE_BLEND)
     return Coordinates(
-        half=jnp.log1p(jnp.rad2deg(theta_h)),
+        half=xp.log1p(xp.rad2deg(theta_h)),
         azimuth=np.pi / 2 + (azimuth - np.pi / 2) * blend,
         theta_i=theta_i,
         theta_o=theta_o,
-        tan2_half=tangential2 / jnp.maximum(normal, 1e-3) ** 2,
-        cos_difference=jnp.clip(cos_difference, 0.0, 1.0),
+        tan2_half=tangential2 / xp.maximum(normal, 1e-3) ** 2,
+        cos_difference=xp.clip(cos_difference, 0.0, 1.0),
     )
 
 
-def coordinates_on_axes(theta_i: Float[Array, ""], theta_o: Float[Array, " o"], phi_o: Float[Array, " p"], theta_limit):
+def coordinates_on_axes(
+    theta_i: Float[AnyArray, ""], theta_o: Float[AnyArray, " o"], phi_o: Float[AnyArray, " p"], theta_limit
+):
     """`guided_coordinates` [o, p] of all combinations of two axes, at one incident angle."""
-    theta_o, phi_o = jnp.meshgrid(theta_o, phi_o, indexing="ij")
-    return guided_coordinates(jnp.broadcast_to(theta_i, theta_o.shape), theta_o, phi_o, theta_limit)
+    xp = array_module(theta_i, theta_o, phi_o, theta_limit)
+    theta_o, phi_o = xp.meshgrid(theta_o, phi_o, indexing="ij")
+    return guided_coordinates(xp.broadcast_to(theta_i, theta_o.shape), theta_o, phi_o, theta_limit)
 
 
 def exchanged(at: Coordinates) -> Coordinates:
@@ -84,13 +86,13 @@ def exchanged(at: Coordinates) -> Coordinates:
     return dataclasses.replace(at, theta_i=at.theta_o, theta_o=at.theta_i)
 
 
-def floored_cos(theta, xp=jnp):
-    """Cosine of polar angles [rad], at least cos 85 degrees, by JAX or NumPy as `xp`."""
+def floored_cos(theta: Float[AnyArray, "*shape"]) -> Float[AnyArray, "*shape"]:
+    """Cosine of polar angles [rad], at least cos 85 degrees."""
+    xp = array_module(theta)
     return xp.maximum(xp.cos(theta), COS_FLOOR)
 
 
-@jax.jit
-def log_scale(at: Coordinates, floor: Float[Array, ""]) -> Float[Array, "*shape"]:
+def log_scale(at: Coordinates, floor: Float[AnyArray, ""] | float) -> Float[AnyArray, "*shape"]:
     """Factor (cos theta_i cos theta_o)^1/4 / floor [sr] on a value in the generalised logarithm.
 
     What an instrument cannot see grows towards grazing. The factor is the same for both
@@ -99,24 +101,28 @@ def log_scale(at: Coordinates, floor: Float[Array, ""]) -> Float[Array, "*shape"
     return (floored_cos(at.theta_i) * floored_cos(at.theta_o)) ** COS_POWER / floor
 
 
-@jax.jit
 def to_log(
-    value: Float[Array, "*shape wavelength"], scale: Float[Array, "*shape"]
-) -> Float[Array, "*shape wavelength"]:
+    value: Float[AnyArray, "*shape wavelength"], scale: Float[AnyArray, "*shape"]
+) -> Float[AnyArray, "*shape wavelength"]:
     """Generalised logarithm z = log(1 + value scale): relative above the floor, absolute below.
 
     Values below 0 are counted as 0: they are at or below the noise.
     """
-    return jnp.log1p(jnp.maximum(value, 0.0) * scale[..., None])
+    xp = array_module(value, scale)
+    return xp.log1p(xp.maximum(value, 0.0) * scale[..., None])
 
 
-@jax.jit
-def from_log(z: Float[Array, "*shape wavelength"], scale: Float[Array, "*shape"]) -> Float[Array, "*shape wavelength"]:
+def from_log(
+    z: Float[AnyArray, "*shape wavelength"], scale: Float[AnyArray, "*shape"]
+) -> Float[AnyArray, "*shape wavelength"]:
     """Inverse of `to_log`; never negative, because a z below 0 counts as 0."""
-    return jnp.expm1(jnp.clip(z, 0.0, LARGEST_Z)) / scale[..., None]
+    xp = array_module(z, scale)
+    return xp.expm1(xp.clip(z, 0.0, LARGEST_Z)) / scale[..., None]
 
 
-@jax.jit
-def slope(z: Float[Array, "*shape wavelength"], scale: Float[Array, "*shape"]) -> Float[Array, "*shape wavelength"]:
+def slope(
+    z: Float[AnyArray, "*shape wavelength"], scale: Float[AnyArray, "*shape"]
+) -> Float[AnyArray, "*shape wavelength"]:
     """Derivative of `from_log` by z [1/sr]; where z is below 0, that at 0."""
-    return jnp.exp(jnp.clip(z, 0.0, LARGEST_Z)) / scale[..., None]
+    xp = array_module(z, scale)
+    return xp.exp(xp.clip(z, 0.0, LARGEST_Z)) / scale[..., None]

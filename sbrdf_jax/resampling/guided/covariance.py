@@ -12,9 +12,10 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
+from sbrdf_jax.array_module import AnyArray, array_module
 from sbrdf_jax.records import pytree
 from sbrdf_jax.resampling.guided.coordinates import Coordinates, coordinates_on_axes, exchanged, guided_coordinates
 from sbrdf_jax.resampling.guided.nodes import (
@@ -39,15 +40,13 @@ class GroupedFeatures:
     azimuth: Any  # [group, member, mode]
 
 
-@jax.jit
-def group_coordinates(angles: Float[Array, "3 group member"], theta_limit: Float[Array, " 2"]) -> Coordinates:
+def group_coordinates(angles: Float[AnyArray, "3 group member"], theta_limit: Float[AnyArray, " 2"]) -> Coordinates:
     """Coordinates of centres as the residual sees them: each group at one incident angle, its members' mean."""
     at = guided_coordinates(angles[0], angles[1], angles[2], theta_limit)
-    mean = jnp.mean(at.theta_i, axis=1, keepdims=True)
-    return dataclasses.replace(at, theta_i=jnp.broadcast_to(mean, at.theta_i.shape))
+    mean = at.theta_i.mean(axis=1, keepdims=True)
+    return dataclasses.replace(at, theta_i=array_module(mean).broadcast_to(mean, at.theta_i.shape))
 
 
-@jax.jit
 def group_features(at: Coordinates) -> GroupedFeatures:
     """Return the features of grouped centres [group, member], of one theta_i each group."""
     features = features_of(at)
@@ -61,20 +60,22 @@ def flatten(at: Coordinates) -> Coordinates:
 
 def _by_theta_i(variance):
     """Variances of one grid's modes as [mode of theta_i, other mode], the order of the features."""
-    return jnp.moveaxis(jnp.asarray(variance), 1, 0).reshape(variance.shape[1], -1)
+    return array_module(variance).moveaxis(variance, 1, 0).reshape(variance.shape[1], -1)
 
 
 def _covariance(variance: ModeVariance, left: Features, right: GroupedFeatures):
-    total = 0.0
+    xp, total = array_module(left.theta_i, right.theta_i), 0.0
     for name in GRIDS:
         pairs = left.theta_i[:, None, :] * right.theta_i[None, :, :]  # [direction, group, mode]
         weighted = (pairs @ _by_theta_i(getattr(variance, name))) * getattr(left, name)[:, None, :]
-        total = total + jnp.einsum("dgf,gmf->dgm", weighted, getattr(right, name))
-    return total.reshape(left.theta_i.shape[0], -1)
+        # [direction, group, other mode] with [group, member, other mode], group by group
+        total = total + xp.swapaxes(weighted, 0, 1) @ xp.swapaxes(getattr(right, name), 1, 2)
+    return xp.swapaxes(total, 0, 1).reshape(left.theta_i.shape[0], -1)
 
 
-@jax.jit
-def covariance(variance: ModeVariance, at: Coordinates, centres: GroupedFeatures) -> Float[Array, "direction centre"]:
+def covariance(
+    variance: ModeVariance, at: Coordinates, centres: GroupedFeatures
+) -> Float[AnyArray, "direction centre"]:
     """Prior covariance A E^-1 A' of the residual between directions and grouped centres (flattened)."""
 
     def of_chunk(chunk):
@@ -86,25 +87,28 @@ def covariance(variance: ModeVariance, at: Coordinates, centres: GroupedFeatures
     return in_chunks(of_chunk, at, DIRECTIONS_AT_A_TIME)
 
 
-def in_chunks(function: Callable[[Any], Array], directions: Any, size: int) -> Array:
+def in_chunks(function: Callable[[Any], AnyArray], directions: Any, size: int) -> AnyArray:
     """Map a function of directions [direction] over chunks of equal size, so that memory stays bounded."""
-    count = jax.tree.leaves(directions)[0].shape[0]
+    leaves = jax.tree.leaves(directions)
+    xp, count = array_module(*leaves), leaves[0].shape[0]
     size = -(-count // max(-(-count // size), 1)) if count else 1
-    chunks = jax.tree.map(lambda x: jnp.pad(x, (0, -count % size)).reshape(-1, size), directions)
+    chunks = jax.tree.map(lambda x: xp.pad(x, (0, -count % size)).reshape(-1, size), directions)
+    if xp is np:
+        parts = [function(jax.tree.map(lambda x, k=k: x[k], chunks)) for k in range(-(-count // size))]
+        return np.concatenate(parts)[:count]
     out = jax.lax.map(function, chunks)
     return out.reshape(-1, *out.shape[2:])[:count]
 
 
-@jax.jit
-def prior_variance(variance: ModeVariance, at: Coordinates) -> Float[Array, " direction"]:
+def prior_variance(variance: ModeVariance, at: Coordinates) -> Float[AnyArray, " direction"]:
     """Prior variance of the residual in each direction: the diagonal of `covariance` with itself."""
     features = features_of(at)
 
     def with_features(others: Features):
-        total = jnp.zeros_like(at.theta_i)
+        total = 0.0
         for name in GRIDS:
             weight = (features.theta_i * others.theta_i) @ _by_theta_i(getattr(variance, name))
-            total = total + jnp.sum(weight * getattr(features, name) * getattr(others, name), axis=1)
+            total = total + (weight * getattr(features, name) * getattr(others, name)).sum(axis=1)
         return total
 
     if not variance.reciprocal:
@@ -112,60 +116,58 @@ def prior_variance(variance: ModeVariance, at: Coordinates) -> Float[Array, " di
     return (with_features(features) + with_features(features_of(exchanged(at)))) / 2
 
 
-@jax.jit
 def covariance_on_axes(
     variance: ModeVariance,
-    centre: Float[Array, "3 group member"],
-    theta_limit: Float[Array, " 2"],
-    theta_i: Float[Array, ""],
-    theta_o: Float[Array, " o"],
-    phi_o: Float[Array, " p"],
-) -> tuple[Float[Array, "o p centre"], Float[Array, "o p"]]:
+    centre: Float[AnyArray, "3 group member"],
+    theta_limit: Float[AnyArray, " 2"],
+    theta_i: Float[AnyArray, ""],
+    theta_o: Float[AnyArray, " o"],
+    phi_o: Float[AnyArray, " p"],
+) -> tuple[Float[AnyArray, "o p centre"], Float[AnyArray, "o p"]]:
     """`covariance` and `prior_variance` of all combinations of two axes, at one incident angle.
 
     The modes of both polar angles are summed once for all azimuths: a tenth of the work.
     """
+    xp = array_module(centre, theta_limit, theta_i, theta_o, phi_o)
     at = coordinates_on_axes(theta_i, theta_o, phi_o, theta_limit)
     places = group_coordinates(centre, theta_limit)
     along_i, along_o = axis_features(at.theta_i[:, 0], THETA), axis_features(at.theta_o[:, 0], THETA)
     centre_i, centre_o = axis_features(places.theta_i[:, 0], THETA), axis_features(places.theta_o, THETA)
     polar = along_i[:, :, None] * along_o[:, None, :]  # [o, mode of theta_i, mode of theta_o]
     if variance.reciprocal:
-        polar = (polar + jnp.swapaxes(polar, 1, 2)) / 2
+        polar = (polar + xp.swapaxes(polar, 1, 2)) / 2
     total, prior = 0.0, 0.0
     for name, (axis, _, _) in GRIDS.items():
         around, at_centre = axis_features(getattr(at, name), axis), axis_features(getattr(places, name), axis)
-        weighted = polar[:, None] * jnp.asarray(getattr(variance, name))[None]  # [o, first mode, two modes]
-        prior = prior + jnp.einsum("of,opf->op", jnp.sum(weighted * polar[:, None], axis=(2, 3)), around**2)
-        of_group = jnp.tensordot(centre_i, weighted, (1, 2))  # [group, o, first mode, mode of theta_o]
-        of_centre = jnp.einsum("gofk,gmk->gofm", of_group, centre_o) * jnp.swapaxes(at_centre, 1, 2)[:, None]
-        total = total + jnp.einsum("opf,gofm->opgm", around, of_centre)
-    return total.reshape(*at.half.shape, -1), prior
+        weighted = polar[:, None] * getattr(variance, name)[None]  # [o, first mode, two modes]
+        of_first = (weighted * polar[:, None]).sum(axis=(2, 3))
+        prior = prior + (around**2 @ of_first[:, :, None])[:, :, 0]
+        of_group = xp.tensordot(centre_i, weighted, (1, 2))  # [group, o, first mode, mode of theta_o]
+        of_centre = of_group @ xp.swapaxes(centre_o, 1, 2)[:, None] * xp.swapaxes(at_centre, 1, 2)[:, None]
+        total = total + around[None] @ of_centre  # [group, o, p, member]
+    return xp.moveaxis(total, 0, 2).reshape(*at.half.shape, -1), prior
 
 
 def mode_sums(
-    centres: GroupedFeatures, dual: Float[Array, "centre wavelength"]
-) -> dict[str, Float[Array, "first theta_i theta_o wavelength"]]:
+    centres: GroupedFeatures, dual: Float[AnyArray, "centre wavelength"]
+) -> dict[str, Float[AnyArray, "first theta_i theta_o wavelength"]]:
     """Sum the centres' features, weighed by `dual`: A' in terms of modes, for both grids."""
-    grouped = dual.reshape(*centres.half.shape[:2], -1)
+    xp, grouped = array_module(centres.half, dual), dual.reshape(*centres.half.shape[:2], -1)
     sums = {}
     for name, axes in GRIDS.items():
-        by_group = jnp.einsum("gmf,gmw->gfw", getattr(centres, name), grouped)
-        modes = jnp.einsum("gk,gfw->kfw", centres.theta_i, by_group)
+        by_group = xp.swapaxes(getattr(centres, name), 1, 2) @ grouped
+        modes = xp.tensordot(centres.theta_i, by_group, (0, 0))
         modes = modes.reshape(axes[1].count, axes[0].count, axes[2].count, -1)
-        sums[name] = jnp.moveaxis(modes, 0, 1)
+        sums[name] = xp.moveaxis(modes, 0, 1)
     return sums
 
 
-@jax.jit
 def node_values(
-    variance: ModeVariance, centres: GroupedFeatures, dual: Float[Array, "centre wavelength"]
-) -> tuple[Float[Array, "half theta_i theta_o wavelength"], Float[Array, "azimuth theta_i theta_o wavelength"]]:
+    variance: ModeVariance, centres: GroupedFeatures, dual: Float[AnyArray, "centre wavelength"]
+) -> tuple[Float[AnyArray, "half theta_i theta_o wavelength"], Float[AnyArray, "azimuth theta_i theta_o wavelength"]]:
     """Return the nodes x = E^-1 A' a of both grids, from dual coefficients a."""
     sums = mode_sums(centres, dual)
     if variance.reciprocal:
-        sums = {name: (modes + jnp.swapaxes(modes, 1, 2)) / 2 for name, modes in sums.items()}
-    half, azimuth = (
-        synthesise(sums[name] * jnp.asarray(getattr(variance, name))[..., None], axes) for name, axes in GRIDS.items()
-    )
+        sums = {name: (modes + array_module(modes).swapaxes(modes, 1, 2)) / 2 for name, modes in sums.items()}
+    half, azimuth = (synthesise(sums[name] * getattr(variance, name)[..., None], axes) for name, axes in GRIDS.items())
     return half, azimuth

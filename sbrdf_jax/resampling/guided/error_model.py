@@ -2,11 +2,11 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from sbrdf_jax.array_module import AnyArray, array_module
 from sbrdf_jax.records import pytree
 
 SMALLEST_FLOOR = 5e-4  # 1/sr, an albedo of 0.16 %: below it, what is measured is mostly clipped noise
@@ -120,31 +120,26 @@ def fit_residual_scale(
         for k in range(shape[2]):
             place = np.searchsorted(cumulative[:, k], COVERED * cumulative[-1, k])
             table[i, j, k] = size[min(place, len(size) - 1)]
-    return ResidualScale(
-        log_scale=jnp.log(jnp.maximum(jnp.asarray(table), 1e-6)), start=jnp.asarray(start), step=jnp.asarray(step)
-    )
+    return ResidualScale(log_scale=np.log(np.maximum(table, 1e-6)), start=start, step=step)
 
 
 def residual_scale(
     scale: ResidualScale,
-    theta_i: Float[Array, "*direction"],
-    half: Float[Array, "*direction"],
-    z: Float[Array, "*direction wavelength"],
-) -> Float[Array, "*direction wavelength"]:
+    theta_i: Float[AnyArray, "*direction"],
+    half: Float[AnyArray, "*direction"],
+    z: Float[AnyArray, "*direction wavelength"],
+) -> Float[AnyArray, "*direction wavelength"]:
     """Interpolate the table of `fit_residual_scale`, linearly in its logarithm."""
-    shape = scale.log_scale.shape
-    ones = jnp.ones_like(z)
-    total = jnp.zeros_like(z)
-    places = []
-    for axis, feature in enumerate((theta_i[..., None] * ones, half[..., None] * ones, z)):
-        x = jnp.clip((feature - scale.start[axis]) / scale.step[axis], 0.0, shape[axis] - 1.0)
-        low = jnp.clip(jnp.floor(x), 0.0, shape[axis] - 2.0)
-        places.append((low.astype(jnp.int32), x - low))
-    for corner in np.ndindex(2, 2, 2):
-        weight = jnp.ones_like(z)
-        index = []
-        for (low, part), up in zip(places, corner, strict=True):
-            weight = weight * (part if up else 1 - part)
-            index.append(low + np.int32(up))
-        total = total + weight * scale.log_scale[index[0], index[1], index[2]]
-    return jnp.exp(total)
+    xp, table = array_module(scale.log_scale, theta_i, half, z), scale.log_scale
+
+    def place(axis, feature):
+        x = xp.clip((feature - scale.start[axis]) / scale.step[axis], 0.0, table.shape[axis] - 1.0)
+        low = xp.clip(xp.floor(xp.nan_to_num(x)), 0.0, table.shape[axis] - 2.0)  # nan is no index
+        return low.astype(np.int32), x - low
+
+    (i, along_i), (j, along_j), (k, along_k) = place(0, theta_i), place(1, half), place(2, z)
+    along_i, along_j, one = along_i[..., None], along_j[..., None], np.int32(1)
+    below, above = ((1 - along_j) * table[row, j] + along_j * table[row, j + one] for row in (i, i + one))
+    of_direction = (1 - along_i) * below + along_i * above  # [*direction, node of z]
+    low, high = (xp.take_along_axis(of_direction, index, axis=-1) for index in (k, k + one))
+    return xp.exp((1 - along_k) * low + along_k * high)

@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from sbrdf_jax.angles import fold_azimuth
@@ -81,7 +81,7 @@ def estimate(
     z = centres.mean(z_sample)
 
     say("lobe model")
-    half = np.asarray(centres.at.half)
+    half = centres.at.half
     density = np.zeros(centres.count)
     density[seen] = density_weights(half[seen])
     lobe, model_residual = fit_lobe_model(centres.mean(np.maximum(samples.value, 0.0)), z, centres.at, density, floor)
@@ -92,7 +92,7 @@ def estimate(
     factor = np.ones(centres.count)
     factor[seen] = noise_factors(half[seen], *centres.angles[:2, seen], choice.left_out[seen])
     noise = centres.noise(choice.noise) * factor
-    whiten = whitener(np.asarray(centres.prior(choice.variance)), noise)
+    whiten = whitener(centres.prior(choice.variance), noise)
     lower = lower_product(whiten)
     inverse = mirror_lower(lower)
 
@@ -122,17 +122,15 @@ def estimate(
 
 def _sample_logarithm(samples: RawSamples, floor: float, centres: Centres):
     """Return the generalised logarithm of the samples [sample, wavelength], and their coordinates."""
-    angles = (jnp.asarray(a) for a in (samples.theta_i, samples.theta_o, samples.phi_o, centres.theta_limit))
-    at = guided_coordinates(*angles)
-    return np.asarray(to_log(jnp.asarray(samples.value), log_scale(at, jnp.asarray(floor)))), at
+    at = guided_coordinates(samples.theta_i, samples.theta_o, samples.phi_o, centres.theta_limit)
+    return to_log(samples.value, log_scale(at, floor)), at
 
 
 def _split(centres: Centres, z_sample: np.ndarray, at_samples, lobe: LobeModel, floor: float):
     """Return what the lobe model leaves at the centres, and what it says there [centre, wavelength]."""
-    level = jnp.asarray(floor)
-    residual = centres.mean(z_sample - np.asarray(lobe_log_value(lobe, at_samples, level)))
+    residual = centres.mean(z_sample - lobe_log_value(lobe, at_samples, floor))
     seen = (centres.number > 0)[:, None]
-    return residual, np.where(seen, np.asarray(lobe_log_value(lobe, centres.at, level)), 0.0)
+    return residual, np.where(seen, lobe_log_value(lobe, centres.at, floor), 0.0)
 
 
 def _left_out_fifths(seen: np.ndarray, lower: np.ndarray, dual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -146,10 +144,10 @@ def _calibrate(centres: Centres, samples: RawSamples, predicted, spread, floor: 
     rows = spread_rows(samples.num_samples)
     centre = centres.index[rows]
     z = predicted[centre]
-    scale = log_scale(centres.at, jnp.asarray(floor))[centre]
-    value, unit = (np.asarray(f(jnp.asarray(z), scale)) for f in (from_log, slope))
+    scale = log_scale(centres.at, floor)[centre]
+    value, unit = from_log(z, scale), slope(z, scale)
     standardised = (np.maximum(samples.value[rows], 0.0) - value) / (unit * np.sqrt(spread[centre])[:, None])
-    return fit_residual_scale(centres.angles[0, centre], np.asarray(centres.at.half)[centre], z, standardised)
+    return fit_residual_scale(centres.angles[0, centre], centres.at.half[centre], z, standardised)
 
 
 def restore_estimates(field: GuidedField, samples: RawSamples, centres: Centres) -> Estimates:
@@ -161,20 +159,21 @@ def restore_estimates(field: GuidedField, samples: RawSamples, centres: Centres)
         centres: Where the samples are.
     """
     floor = float(field.floor)
-    lobe = LobeModel(jnp.asarray(field.lobe.shape), jnp.asarray(field.measured.log_amplitude))
+    field = jax.tree.map(np.asarray, field)
+    lobe = LobeModel(field.lobe.shape, field.measured.log_amplitude)
     residual, model = _split(centres, *_sample_logarithm(samples, floor, centres), lobe, floor)
-    noise = np.asarray(field.noise).reshape(-1)
-    whiten = whitener(np.asarray(centres.prior(field.variance)), noise)
+    noise = field.noise.reshape(-1)
+    whiten = whitener(centres.prior(field.variance), noise)
     return Estimates(
-        wavelength_nm=np.asarray(field.measured.wavelength_nm),
+        wavelength_nm=field.measured.wavelength_nm,
         floor=floor,
         lobe=lobe,
-        model_residual=np.asarray(field.measured.model_residual),
+        model_residual=field.measured.model_residual,
         variance=field.variance,
         noise_level=float(field.noise_level),
-        factor=np.asarray(field.noise_factor).reshape(-1),
+        factor=field.noise_factor.reshape(-1),
         noise=noise,
-        curve=tuple(map(tuple, np.asarray(field.curve).T)),
+        curve=tuple(map(tuple, field.curve.T)),
         reciprocity_cost=float(field.reciprocity_cost),
         scale=field.scale,
         whiten=whiten,

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sbrdf_jax.array_module import AnyArray, array_module
 from sbrdf_jax.records import pytree
 from sbrdf_jax.resampling.guided.coordinates import (
     Coordinates,
@@ -108,9 +109,10 @@ def each_direction(function: Callable[[Any], Array], directions: Any, num_wavele
 
 def field_whitener(field: GuidedField) -> np.ndarray:
     """Inverse Cholesky factor [centre, centre] of prior covariance plus noise, which standard errors need."""
-    centres = group_coordinates(jnp.asarray(field.centre), jnp.asarray(field.theta_limit))
-    prior = covariance(field.variance, flatten(centres), group_features(centres))
-    return whitener(np.asarray(prior), np.asarray(field.noise).reshape(-1))
+    variance, centre, limit = jax.tree.map(np.asarray, (field.variance, field.centre, field.theta_limit))
+    centres = group_coordinates(centre, limit)
+    prior = covariance(variance, flatten(centres), group_features(centres))
+    return whitener(prior, np.asarray(field.noise).reshape(-1))
 
 
 @jax.jit
@@ -137,8 +139,9 @@ def unexplained(
 def _errors(field: GuidedField, at: Coordinates, z, variance):
     """Return values, standard errors and the noise of one measurement [1/sr] from z and its variance."""
     scale = log_scale(at, field.floor)
+    xp = array_module(z, variance)
     unit = residual_scale(field.scale, at.theta_i, at.half, z) * slope(z, scale)
-    return from_log(z, scale), unit * jnp.sqrt(variance)[..., None], unit * jnp.sqrt(field.noise_level)
+    return from_log(z, scale), unit * xp.sqrt(variance)[..., None], unit * xp.sqrt(field.noise_level)
 
 
 @jax.jit
@@ -177,36 +180,34 @@ def evaluate_with_error(
     return found[:, 0], found[:, 1], found[:, 2]
 
 
-@jax.jit
 def evaluate_on_axes(
-    field: GuidedField, theta_i: Float[Array, ""], theta_o: Float[Array, " o"], phi_o: Float[Array, " p"]
-) -> Float[Array, "o p wavelength"]:
+    field: GuidedField, theta_i: Float[AnyArray, ""], theta_o: Float[AnyArray, " o"], phi_o: Float[AnyArray, " p"]
+) -> Float[AnyArray, "o p wavelength"]:
     """`evaluate_direction` at all combinations of two axes, at one incident angle."""
     at, z = _log_value_on_axes(field, theta_i, theta_o, phi_o)
     return from_log(z, log_scale(at, field.floor))
 
 
-@jax.jit
 def evaluate_on_axes_with_error(
     field: GuidedField,
-    theta_i: Float[Array, ""],
-    theta_o: Float[Array, " o"],
-    phi_o: Float[Array, " p"],
-    variance: Float[Array, "o p"],
-) -> tuple[Float[Array, "o p wavelength"], Float[Array, "o p wavelength"]]:
+    theta_i: Float[AnyArray, ""],
+    theta_o: Float[AnyArray, " o"],
+    phi_o: Float[AnyArray, " p"],
+    variance: Float[AnyArray, "o p"],
+) -> tuple[Float[AnyArray, "o p wavelength"], Float[AnyArray, "o p wavelength"]]:
     """Values and standard errors [1/sr] at all combinations of two axes, from `unexplained` variances there."""
     at, z = _log_value_on_axes(field, theta_i, theta_o, phi_o)
     return _errors(field, at, z, variance)[:2]
 
 
-def _log_value_on_axes(field: GuidedField, theta_i, theta_o, phi_o) -> tuple[Coordinates, Array]:
+def _log_value_on_axes(field: GuidedField, theta_i, theta_o, phi_o) -> tuple[Coordinates, AnyArray]:
     """Coordinates and z; nodes are summed over both polar angles once for all azimuths."""
     at = coordinates_on_axes(theta_i, theta_o, phi_o, field.theta_limit)
     z = lobe_log_value(field.lobe, at, field.floor)
     for name, (axis, axis_i, axis_o) in GRIDS.items():
-        nodes = jnp.asarray(getattr(field, name))
-        first, weight = cubic_weights(at.theta_i[0, 0], axis_i)
-        nodes = jnp.tensordot(weight, jax.lax.dynamic_slice_in_dim(nodes, first, 4, 1), (0, 1))
-        nodes = jnp.tensordot(cubic_matrix(at.theta_o[:, 0], axis_o), nodes, (1, 1))  # [o, first node, wavelength]
-        z = z + cubic_matrix(getattr(at, name), axis) @ nodes
+        xp, nodes = array_module(z), getattr(field, name)
+        first, weight = cubic_weights(at.theta_i[0, :1], axis_i)
+        nodes = sum(weight[0, k] * xp.take(nodes, first[0] + np.int32(k), axis=1) for k in range(4))
+        nodes = cubic_matrix(at.theta_o[:, 0], axis_o)[None] @ nodes  # [first node, o, wavelength]
+        z = z + cubic_matrix(getattr(at, name), axis) @ xp.swapaxes(nodes, 0, 1)
     return at, z

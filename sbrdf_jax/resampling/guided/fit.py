@@ -2,9 +2,9 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
+from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.nnls import ProjectedNewton
 from sbrdf_jax.resampling.guided.bounds import solve_bounded
 from sbrdf_jax.resampling.guided.centres import Centres
@@ -36,28 +36,28 @@ def solve_field(estimates: Estimates, centres: Centres, needed: np.ndarray, tole
     """
     prior = centres.prior(estimates.variance)
     parts = (estimates.inverse, estimates.noise, estimates.residual[:, needed], estimates.model[:, needed])
-    bounded = solve_bounded(prior, *map(jnp.asarray, parts), ProjectedNewton(tolerance=tolerance))
-    half_nodes, azimuth_nodes = node_values(estimates.variance, centres.features, bounded.dual)
-    amplitude = jnp.asarray(estimates.lobe.log_amplitude)
+    bounded = solve_bounded(prior, *parts, ProjectedNewton(tolerance=tolerance))
+    with one_blas_thread():
+        half_nodes, azimuth_nodes = node_values(estimates.variance, centres.features, bounded.dual)
+    amplitude = estimates.lobe.log_amplitude
     shape = (3, centres.num_groups, centres.num_members)
     field = GuidedField(
-        wavelength_nm=jnp.asarray(estimates.wavelength_nm[needed]),
-        floor=jnp.asarray(estimates.floor),
+        wavelength_nm=estimates.wavelength_nm[needed],
+        floor=np.asarray(estimates.floor),
         lobe=LobeModel(estimates.lobe.shape, amplitude[:, needed]),
         half=mirror(half_nodes),
         azimuth=mirror(azimuth_nodes),
-        theta_limit=jnp.asarray(centres.theta_limit),
-        centre=jnp.asarray(centres.angles.reshape(shape)),
-        noise=jnp.asarray(estimates.noise.reshape(shape[1:])),
-        noise_factor=jnp.asarray(estimates.factor.reshape(shape[1:])),
-        noise_level=jnp.asarray(estimates.noise_level),
+        theta_limit=centres.theta_limit,
+        centre=centres.angles.reshape(shape),
+        noise=estimates.noise.reshape(shape[1:]),
+        noise_factor=estimates.factor.reshape(shape[1:]),
+        noise_level=np.asarray(estimates.noise_level),
         variance=estimates.variance,
         scale=estimates.scale,
         multiplier=bounded.multiplier.reshape(*shape[1:], -1),
-        model_residual=jnp.asarray(estimates.model_residual)[needed],
-        reciprocity_cost=jnp.asarray(estimates.reciprocity_cost),
-        curve=jnp.asarray(np.transpose(estimates.curve)),
-        measured=MeasuredLobe(jnp.asarray(estimates.wavelength_nm), amplitude, jnp.asarray(estimates.model_residual)),
+        model_residual=estimates.model_residual[needed],
+        reciprocity_cost=np.asarray(estimates.reciprocity_cost),
+        curve=np.transpose(estimates.curve),
+        measured=MeasuredLobe(estimates.wavelength_nm, amplitude, estimates.model_residual),
     )
-    proof = (np.asarray(a) for a in (bounded.kkt_residual, bounded.num_steps, bounded.status))
-    return GuidedFit(field, *proof, estimates.whiten)
+    return GuidedFit(field, bounded.kkt_residual, bounded.num_steps, bounded.status, estimates.whiten)

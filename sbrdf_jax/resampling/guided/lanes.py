@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 
 from sbrdf_jax.resampling.guided.field import LAST_AXIS, GuidedField
@@ -13,8 +12,8 @@ _PROOF = ("kkt_residual", "num_steps", "status")
 
 def take_field(field: GuidedField, index: np.ndarray) -> GuidedField:
     """Return a field at some of its wavelengths, by mask or index."""
-    parts = {name: jnp.asarray(getattr(field, name))[..., index] for name in LAST_AXIS}
-    lobe = dataclasses.replace(field.lobe, log_amplitude=jnp.asarray(field.lobe.log_amplitude)[:, index])
+    parts = {name: np.asarray(getattr(field, name))[..., index] for name in LAST_AXIS}
+    lobe = dataclasses.replace(field.lobe, log_amplitude=np.asarray(field.lobe.log_amplitude)[:, index])
     return dataclasses.replace(field, lobe=lobe, **parts)
 
 
@@ -32,8 +31,8 @@ def join_fits(one: GuidedFit, other: GuidedFit) -> GuidedFit:
     def joined(first, second):
         return np.concatenate([np.asarray(first), np.asarray(second)], axis=-1)[..., order]
 
-    parts = {name: jnp.asarray(joined(getattr(one.field, name), getattr(other.field, name))) for name in LAST_AXIS}
-    amplitude = jnp.asarray(joined(one.field.lobe.log_amplitude, other.field.lobe.log_amplitude))
+    parts = {name: joined(getattr(one.field, name), getattr(other.field, name)) for name in LAST_AXIS}
+    amplitude = joined(one.field.lobe.log_amplitude, other.field.lobe.log_amplitude)
     lobe = dataclasses.replace(other.field.lobe, log_amplitude=amplitude)
     proof = {name: joined(getattr(one, name), getattr(other, name)) for name in _PROOF}
     return other._replace(field=dataclasses.replace(other.field, lobe=lobe, **parts), **proof)
@@ -53,7 +52,7 @@ def with_dead_wavelengths(
     if known.all():
         return field
     names = [name for name in LAST_AXIS if name != "wavelength_nm"]
-    parts = {name: jnp.asarray(spread(np.asarray(getattr(field, name)), known, missing)) for name in names}
+    parts = {name: spread(np.asarray(getattr(field, name)), known, missing) for name in names}
     amplitude = spread(np.asarray(field.lobe.log_amplitude), known, np.full(len(known), -np.inf))
-    lobe = dataclasses.replace(field.lobe, log_amplitude=jnp.asarray(amplitude))
-    return dataclasses.replace(field, wavelength_nm=jnp.asarray(wavelength_nm), lobe=lobe, **parts)
+    lobe = dataclasses.replace(field.lobe, log_amplitude=amplitude)
+    return dataclasses.replace(field, wavelength_nm=wavelength_nm, lobe=lobe, **parts)

@@ -6,13 +6,12 @@ compiling it would take a hundred times longer than solving it.
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.resampling.guided.coordinates import Coordinates, log_scale
-from sbrdf_jax.resampling.guided.lobe_model import LobeModel, terms_of
+from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_terms
 
 NUM_TERMS = 4  # diffuse, mirror, narrow lobe, broad lobe
 NUM_FIT_WAVELENGTHS = 8  # the shared shape is fitted to about so many
@@ -64,16 +63,15 @@ def fit_lobe_model(
     Returns:
         The model, and per wavelength the relative norm of the loss's gradient by its log amplitudes.
     """
-    scale = np.asarray(log_scale(at, jnp.asarray(floor)))
-    host = Coordinates(**{name: np.asarray(array) for name, array in vars(at).items()})
+    scale = log_scale(at, floor)
     lowest, highest = np.log(floor) + LOG_AMPLITUDE_RANGE
-    used = _Problem(host, np.ascontiguousarray(z.T), weight, scale, float(lowest), float(highest))
-    amplitude = used.clip(_start(value, host, weight > 0))
+    used = _Problem(at, np.ascontiguousarray(z.T), weight, scale, float(lowest), float(highest))
+    amplitude = used.clip(_start(value, at, weight > 0))
     every = max(1, z.shape[1] // NUM_FIT_WAVELENGTHS)
     with one_blas_thread():
         shape = _fit_shape(used._replace(z=used.z[::every]), amplitude[::every])
-        amplitude, gradient = _fit_amplitudes(used, terms_of(shape, host, np), amplitude)
-    return LobeModel(jnp.asarray(shape), jnp.asarray(amplitude.T)), gradient
+        amplitude, gradient = _fit_amplitudes(used, lobe_terms(shape, at), amplitude)
+    return LobeModel(shape, amplitude.T), gradient
 
 
 def density_weights(half: np.ndarray) -> np.ndarray:
@@ -86,7 +84,7 @@ def density_weights(half: np.ndarray) -> np.ndarray:
 
 def _start(value: np.ndarray, at: Coordinates, used: np.ndarray) -> Float[np.ndarray, "wavelength 4"]:
     """Starting log amplitudes from medians of ratios in rings of theta_h."""
-    terms = terms_of(PRIOR, at, np)[used]
+    terms = lobe_terms(PRIOR, at)[used]
     theta_h = np.expm1(at.half)[used]  # deg
     value = value[used]
     tiny = 1e-6 * float(np.median(value[value > 0]))
@@ -136,13 +134,13 @@ def _fit_shape(problem: _Problem, log_amplitude: np.ndarray) -> Float[np.ndarray
     def loss_of(residual, shape):
         return _loss(residual, weight).sum() + float(pull_of_prior @ (shape - PRIOR) ** 2)
 
-    residual, slope = _residual(problem, terms_of(shape, problem.at, np), log_amplitude)
+    residual, slope = _residual(problem, lobe_terms(shape, problem.at), log_amplitude)
     loss, fresh = loss_of(residual, shape), True
     for _ in range(SHAPE_STEPS):
         if fresh:
-            parts = np.exp(log_amplitude)[:, :, None] * terms_of(shape, problem.at, np).T
+            parts = np.exp(log_amplitude)[:, :, None] * lobe_terms(shape, problem.at).T
             steps = DIFFERENCE * np.eye(len(shape))
-            change = [terms_of(shape + h, problem.at, np) - terms_of(shape - h, problem.at, np) for h in steps]
+            change = [lobe_terms(shape + h, problem.at) - lobe_terms(shape - h, problem.at) for h in steps]
             by_shape = np.stack(change) / (2 * DIFFERENCE)  # [shape, sample, term]
             shared = np.einsum("snt,mt->msn", by_shape, np.exp(log_amplitude)) * slope[:, None, :]
             jacobian = np.concatenate([parts * slope[:, None, :], shared], axis=1)
@@ -157,7 +155,7 @@ def _fit_shape(problem: _Problem, log_amplitude: np.ndarray) -> Float[np.ndarray
         new_shape = np.clip(shape + move, LOWER, UPPER)
         step = -(solved[:, :, -1] + solved[:, :, :-1] @ (new_shape - shape))
         new_amplitude = problem.clip(log_amplitude + np.clip(step, -LARGEST_CHANGE, LARGEST_CHANGE))
-        found = _residual(problem, terms_of(new_shape, problem.at, np), new_amplitude)
+        found = _residual(problem, lobe_terms(new_shape, problem.at), new_amplitude)
         new_loss = loss_of(found[0], new_shape)
         fresh = bool(new_loss < loss)
         if not fresh:

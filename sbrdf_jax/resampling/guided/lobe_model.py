@@ -7,10 +7,9 @@ towards grazing, a coated surface does), held near their priors where the data s
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from sbrdf_jax.array_module import AnyArray, array_module
 from sbrdf_jax.records import pytree
 from sbrdf_jax.resampling.guided.coordinates import Coordinates, floored_cos, log_scale, to_log
 
@@ -30,32 +29,28 @@ class LobeModel:
     log_amplitude: Any  # [4, wavelength]; in units of the floor's scale: exp gives 1/sr
 
 
-def fresnel(cos, index, xp=jnp):
-    """Unpolarised Fresnel reflectance of a dielectric of refractive index `index`, by JAX or NumPy as `xp`."""
+def fresnel(cos, index):
+    """Unpolarised Fresnel reflectance of a dielectric of refractive index `index`."""
+    xp = array_module(cos, index)
     cos_in = xp.sqrt(1 - (1 - cos**2) / index**2)
     senkrecht = (cos - index * cos_in) / (cos + index * cos_in)
     parallel = (cos_in - index * cos) / (cos_in + index * cos)
     return (senkrecht**2 + parallel**2) / 2
 
 
-@jax.jit
-def lobe_terms(shape: Float[Array, " 9"], at: Coordinates) -> Float[Array, "*shape 4"]:
+def lobe_terms(shape: Float[AnyArray, " 9"], at: Coordinates) -> Float[AnyArray, "*shape 4"]:
     """Return the four terms at amplitude 1, finite everywhere; Fresnel factors are 1 at normal incidence.
 
     Diffuse: (1 - F(theta_i)) (1 - F(theta_o)). Mirror: F(theta_d) exp(-(tan theta_h / width)^4)
     (cos_i cos_o)^-mirror_grazing. Lobes: F(theta_d)^fresnel (G1(i) G1(o) / (cos_i cos_o))^shadowing
     (1 + tan^2 theta_h / width^2)^-2 / cos^4 theta_h.
     """
-    return terms_of(shape, at)
-
-
-def terms_of(shape, at: Coordinates, xp=jnp):
-    """`lobe_terms` by JAX or NumPy as `xp`: on the host nothing is compiled, and few directions take no time."""
+    xp = array_module(shape, at.theta_i)
     index = 1 + xp.exp(shape[0])
     width = xp.exp(shape[1:4])
-    cos_i, cos_o = floored_cos(at.theta_i, xp), floored_cos(at.theta_o, xp)
-    log_fresnel = xp.log(fresnel(at.cos_difference, index, xp) / fresnel(1.0, index, xp))
-    diffuse = (1 - fresnel(cos_i, index, xp)) * (1 - fresnel(cos_o, index, xp))
+    cos_i, cos_o = floored_cos(at.theta_i), floored_cos(at.theta_o)
+    log_fresnel = xp.log(fresnel(at.cos_difference, index) / fresnel(1.0, index))
+    diffuse = (1 - fresnel(cos_i, index)) * (1 - fresnel(cos_o, index))
     ratio = xp.minimum(at.tan2_half / width[0] ** 2, HIGHEST_EXPONENT ** (1 / MIRROR_POWER))
     mirror = xp.exp(log_fresnel - ratio**MIRROR_POWER) * (cos_i * cos_o) ** -shape[8]
     terms = [diffuse, mirror]
@@ -69,8 +64,10 @@ def terms_of(shape, at: Coordinates, xp=jnp):
     return xp.stack(terms, axis=-1)
 
 
-@jax.jit
-def lobe_log_value(model: LobeModel, at: Coordinates, floor: Float[Array, ""]) -> Float[Array, "*shape wavelength"]:
+def lobe_log_value(
+    model: LobeModel, at: Coordinates, floor: Float[AnyArray, ""] | float
+) -> Float[AnyArray, "*shape wavelength"]:
     """Generalised logarithm z of the model."""
-    value = lobe_terms(model.shape, at) @ jnp.exp(model.log_amplitude)
+    xp = array_module(model.shape, at.theta_i)
+    value = lobe_terms(model.shape, at) @ xp.exp(model.log_amplitude)
     return to_log(value, log_scale(at, floor))

@@ -17,10 +17,13 @@ def merge_samples(
 ) -> np.ndarray:
     """Return each sample's cell: by the group of theta_i, theta_o, azimuth [rad] and half = log(theta_h [deg] + 1)."""
     cell = SMALLEST_CELL
-    places = np.stack([theta_o, azimuth * np.sin(theta_o), half / HALF_STRETCH], axis=1)
+    places = theta_o, azimuth * np.sin(theta_o), half / HALF_STRETCH
     while True:
-        cells = np.concatenate([group[:, None], np.round(places / cell).astype(np.int64)], axis=1)
-        distinct, index = np.unique(cells, axis=0, return_inverse=True)
+        number = group  # of the cell; one integer sorts twenty times faster than a row of four
+        for place in places:
+            step = np.round(place / cell).astype(np.int64)
+            number = number * (step.max() + 1) + step
+        distinct, index = np.unique(number, return_inverse=True)
         if len(distinct) <= max(max_centres, 2 * (group.max() + 1)):
             return index.reshape(-1)
         cell *= GROWTH

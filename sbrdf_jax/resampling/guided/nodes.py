@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sbrdf_jax.array_module import AnyArray, array_module
 from sbrdf_jax.records import pytree
 from sbrdf_jax.resampling.guided.coordinates import Coordinates
 
@@ -95,7 +96,9 @@ def mode_variance(terms: tuple[Term, ...], constant: float, reciprocal: bool = F
     return ModeVariance(half=total["half"], azimuth=total["azimuth"], reciprocal=reciprocal)
 
 
-def cubic_weights(x: Float[Array, "*shape"], axis: Axis) -> tuple[Int[Array, "*shape"], Float[Array, "*shape 4"]]:
+def cubic_weights(
+    x: Float[AnyArray, "*shape"], axis: Axis
+) -> tuple[Int[AnyArray, "*shape"], Float[AnyArray, "*shape 4"]]:
     """Return Keys' cubic convolution weights (a = -1/2) of the four nodes around a place.
 
     Args:
@@ -105,11 +108,12 @@ def cubic_weights(x: Float[Array, "*shape"], axis: Axis) -> tuple[Int[Array, "*s
     Returns:
         Index of the first of the four, in the axis with one mirrored node added at each end, and their weights.
     """
+    xp = array_module(x)
     step = (axis.stop - axis.start) / (axis.count - 1)
-    place = jnp.clip((x - axis.start) / step, 0.0, axis.count - 1.0)
-    first = jnp.clip(jnp.floor(place), 0.0, axis.count - 2.0)
+    place = xp.clip((x - axis.start) / step, 0.0, axis.count - 1.0)
+    first = xp.clip(xp.floor(place), 0.0, axis.count - 2.0)
     t = (place - first)[..., None]
-    weight = jnp.concatenate(
+    weight = xp.concatenate(
         [
             ((2 - t) * t - 1) * t / 2,
             ((3 * t - 5) * t * t + 2) / 2,
@@ -118,26 +122,27 @@ def cubic_weights(x: Float[Array, "*shape"], axis: Axis) -> tuple[Int[Array, "*s
         ],
         axis=-1,
     )
-    return first.astype(jnp.int32), weight
+    return first.astype(np.int32), weight
 
 
-def cubic_matrix(x: Float[Array, "*shape"], axis: Axis) -> Float[Array, "*shape node"]:
+def cubic_matrix(x: Float[AnyArray, "*shape"], axis: Axis) -> Float[AnyArray, "*shape node"]:
     """`cubic_weights` as rows over all nodes, the mirrored ones included; for products with a few rows of nodes."""
     first, weight = cubic_weights(x, axis)
-    is_node = jax.nn.one_hot(_four(first), axis.count + 2, dtype=weight.dtype)
-    return jnp.sum(is_node * weight[..., None], axis=-2)
+    nodes = np.arange(axis.count + 2, dtype=np.int32).reshape((1,) * (x.ndim + 1) + (-1,))
+    is_node = _four(first)[..., None] == nodes
+    return array_module(x).where(is_node, weight[..., None], 0.0).sum(axis=-2)
 
 
-def _four(first: Int[Array, "*shape"]) -> Int[Array, "*shape 4"]:
-    return jnp.stack([first + np.int32(k) for k in range(4)], axis=-1)
+def _four(first: Int[AnyArray, "*shape"]) -> Int[AnyArray, "*shape 4"]:
+    return array_module(first).stack([first + np.int32(k) for k in range(4)], axis=-1)
 
 
-def axis_features(x: Float[Array, "*shape"], axis: Axis) -> Float[Array, "*shape mode"]:
+def axis_features(x: Float[AnyArray, "*shape"], axis: Axis) -> Float[AnyArray, "*shape mode"]:
     """Values of the interpolated cosine modes at places along an axis."""
     first, weight = cubic_weights(x, axis)
     mirrored = np.pad(axis.modes, ((1, 1), (0, 0)), mode="reflect")
-    around = jnp.asarray(mirrored, x.dtype)[_four(first)]
-    return jnp.sum(weight[..., None] * around, axis=-2)
+    around = array_module(x).asarray(mirrored, x.dtype)[_four(first)]
+    return (weight[..., None] * around).sum(axis=-2)
 
 
 @pytree()
@@ -163,9 +168,11 @@ def features_of(at: Coordinates) -> Features:
     )
 
 
-def mirror(nodes: Float[Array, "first theta_i theta_o wavelength"]) -> Float[Array, "more more2 more3 wavelength"]:
+def mirror(
+    nodes: Float[AnyArray, "first theta_i theta_o wavelength"],
+) -> Float[AnyArray, "more more2 more3 wavelength"]:
     """Add one mirrored node at each end of the three axes."""
-    return jnp.pad(nodes, ((1, 1), (1, 1), (1, 1), (0, 0)), mode="reflect")
+    return array_module(nodes).pad(nodes, ((1, 1), (1, 1), (1, 1), (0, 0)), mode="reflect")
 
 
 def interpolate(
@@ -187,8 +194,10 @@ def interpolate(
 
 
 def synthesise(
-    amplitude: Float[Array, "first theta_i theta_o wavelength"], axes: tuple[Axis, Axis, Axis]
-) -> Float[Array, "first theta_i theta_o wavelength"]:
+    amplitude: Float[AnyArray, "first theta_i theta_o wavelength"], axes: tuple[Axis, Axis, Axis]
+) -> Float[AnyArray, "first theta_i theta_o wavelength"]:
     """Return node values of a sum of modes."""
-    along = [jnp.asarray(axis.modes) for axis in axes]
-    return jnp.einsum("ai,bj,ck,ijkm->abcm", *along, amplitude, optimize="optimal")
+    for place, axis in enumerate(axes):
+        amplitude = array_module(amplitude).tensordot(axis.modes, amplitude, (1, place))
+        amplitude = array_module(amplitude).moveaxis(amplitude, 0, place)
+    return amplitude

@@ -1,4 +1,4 @@
-"""Functions of two axes of directions, called in blocks of few shapes for those combinations that are needed."""
+"""Functions of two axes of directions, called in blocks for those combinations that are needed."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-ROWS, COLUMNS = 16, 32  # of theta_o and of phi_o in one call: one shape, one compilation
+MOST_AT_A_TIME = 512  # directions; more leave the processor's cache
 
 
 def on_axes(
@@ -26,19 +26,9 @@ def on_axes(
         by_direction: More arguments, of each direction.
     """
     rows, columns = np.flatnonzero(needed.any(axis=1)), np.flatnonzero(needed.any(axis=0))
-    found = None
-    for some in _blocks(rows, ROWS):
-        for others in _blocks(columns, COLUMNS):
-            block = np.ix_(some, others)
-            parts = function(theta_o[some], phi_o[others], *(a[block] for a in by_direction))
-            if found is None:
-                found = tuple(np.empty((*needed.shape, *np.shape(part)[2:])) for part in parts)
-            for whole, part in zip(found, parts, strict=True):
-                whole[block] = np.asarray(part)
-    assert found is not None
-    return tuple(whole[needed] for whole in found)
-
-
-def _blocks(index: np.ndarray, size: int) -> np.ndarray:
-    """Return indices as rows of one size; the last one is filled by its last index."""
-    return np.pad(index, (0, -len(index) % size), mode="edge").reshape(-1, size)
+    found = []
+    for some in np.array_split(rows, -(-len(rows) * len(columns) // MOST_AT_A_TIME)):
+        block = np.ix_(some, columns)
+        parts = function(theta_o[some], phi_o[columns], *(a[block] for a in by_direction))
+        found.append([np.asarray(part)[needed[block]] for part in parts])
+    return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))

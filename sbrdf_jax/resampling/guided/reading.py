@@ -3,12 +3,11 @@
 import functools
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg.blas
 from jaxtyping import Float
 
+from sbrdf_jax.devices import on_host
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.records import GriddedBRDF
@@ -64,9 +63,8 @@ def read_nodes(
         if not len(columns) or not len(rows):
             continue
         part = evaluated_part(field if len(columns) == len(lanes) else take_field(field, columns))
-        part = jax.tree.map(jnp.asarray, part)
         for i in rows:
-            at_i = functools.partial(evaluate_on_axes_with_error, part, grid.theta_i[i])
+            at_i = functools.partial(on_host(evaluate_on_axes_with_error), part, grid.theta_i[i])
             o, p = (place[:, None] for place in np.nonzero(nodes[i]))
             for out, new in zip(value[:, i], on_axes(at_i, *axes, nodes[i], variance[i]), strict=True):
                 out[o, p, columns] = new
@@ -78,7 +76,7 @@ def read_nodes(
 
 def _add_variances(variance: np.ndarray, missing: np.ndarray, field: GuidedField, whiten, theta_i, axes) -> None:
     """Work out the variances that are missing, once for each distinct direction: poles have many azimuths."""
-    prior = (field.variance, *map(jnp.asarray, (field.centre, field.theta_limit)))
+    prior = field.variance, field.centre, field.theta_limit
     pending: list[tuple[np.ndarray, np.ndarray]] = []
     flushed: list[np.ndarray] = []
     distinct = missing.copy()
@@ -86,7 +84,7 @@ def _add_variances(variance: np.ndarray, missing: np.ndarray, field: GuidedField
     distinct[isotropic] = False
     distinct[..., 0] |= isotropic & missing.any(axis=2)
     for i in np.flatnonzero(distinct.any(axis=(1, 2))):
-        pending.append(on_axes(functools.partial(covariance_on_axes, *prior, theta_i[i]), *axes, distinct[i]))
+        pending.append(on_axes(functools.partial(on_host(covariance_on_axes), *prior, theta_i[i]), *axes, distinct[i]))
         if sum(len(part[1]) for part in pending) >= MOST_PENDING:
             flushed.append(_unexplained(pending, whiten))
             pending = []
