@@ -10,7 +10,6 @@ import functools
 import warnings
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from sbrdf_jax.interpolation import spectral_weights
@@ -196,4 +195,4 @@ def _weights_by_interpolation(wavelength_nm: np.ndarray, tables: tuple[Any, Any]
     summed = functions.values * light.values[:, None]
     summed *= 100 / summed[:, 1].sum()
     held = np.clip(one_nm, wavelength_nm[0], wavelength_nm[-1])
-    return np.asarray(spectral_weights(jnp.asarray(held), jnp.asarray(wavelength_nm))).T @ summed
+    return spectral_weights(held, wavelength_nm).T @ summed

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sbrdf_jax.array_module import AnyArray, array_module
 from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.interpolation import spectral_weights
 from sbrdf_jax.records import GriddedBRDF, SpectralBasis, SpectralField
@@ -204,12 +205,11 @@ def encode(
     return jnp.concatenate([pairs[..., :1], pairs[..., 1::2]], axis=-1)
 
 
-@jax.jit
 def decode(
-    coefficient: Float[Array | np.ndarray, "*shape coefficient"],
+    coefficient: Float[AnyArray, "*shape coefficient"],
     basis: SpectralBasis,
-    wavelength_nm: Float[Array | np.ndarray, " wanted"] | None = None,
-) -> Float[Array, "*shape wavelength"]:
+    wavelength_nm: Float[AnyArray, " wanted"] | None = None,
+) -> Float[AnyArray, "*shape wavelength"]:
     """Return spectra from their coefficients, eq. (11).
 
     Args:
@@ -226,7 +226,8 @@ def decode(
         a series repeats or mirrors itself.
     """
     synthesis = basis.synthesis if wavelength_nm is None else _functions_at(wavelength_nm, basis)
-    return jnp.matmul(coefficient, jnp.asarray(synthesis, coefficient.dtype))
+    xp = array_module(coefficient, synthesis)
+    return xp.matmul(coefficient, xp.asarray(synthesis, coefficient.dtype))
 
 
 def encode_field(gridded: GriddedBRDF, basis: SpectralBasis) -> SpectralField:
@@ -273,14 +274,14 @@ def _series(position, kind, count, xp):
 
 def _functions_at(wavelength_nm, basis):
     """Return the basis' functions at wavelengths, as `synthesis` holds them at the measured ones."""
-    measured, count = jnp.asarray(basis.wavelength_nm, wavelength_nm.dtype), basis.synthesis.shape[0]
+    xp = array_module(wavelength_nm, basis.wavelength_nm, basis.synthesis)
+    measured, count = xp.asarray(basis.wavelength_nm, wavelength_nm.dtype), basis.synthesis.shape[0]
     if basis.kind == "data":
         weights = spectral_weights(wavelength_nm, measured)
-        return jnp.matmul(jnp.asarray(basis.synthesis, weights.dtype), weights.T)
+        return xp.matmul(xp.asarray(basis.synthesis, weights.dtype), weights.T)
     if basis.kind != "identity":
-        return _series(_position(wavelength_nm, measured), basis.kind, count, jnp)
+        return _series(_position(wavelength_nm, measured), basis.kind, count, xp)
     if count == 1:
-        return jnp.ones((1, *wavelength_nm.shape), wavelength_nm.dtype)
+        return xp.ones((1, *wavelength_nm.shape), wavelength_nm.dtype)
     # node j's hat is the interpolation of the j-th row of the identity
-    identity = jnp.eye(count, dtype=wavelength_nm.dtype)
-    return jax.vmap(lambda row: jnp.interp(wavelength_nm, measured, row))(identity)
+    return xp.stack([xp.interp(wavelength_nm, measured, row) for row in np.eye(count, dtype=wavelength_nm.dtype)])

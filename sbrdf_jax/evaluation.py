@@ -27,6 +27,7 @@ from sbrdf_jax.resampling.guided.field import (
     GuidedField,
     each_direction,
     evaluate_direction,
+    evaluate_directions,
     evaluate_with_error,
     evaluated_part,
     field_whitener,
@@ -248,13 +249,44 @@ def evaluate_in_chunks(
         MOST_AT_A_TIME,
     )
     value = np.empty((count, num_wavelengths))
-    result = on_device(result)
+    on_host = host_function(result, wavelength)
+    result = on_device(result) if on_host is None else result
     for start in range(0, count, size):
         part = [a[start : start + size] for a in flat]
         length = part[0].size
+        if on_host is not None:
+            value[start : start + length] = on_host(*part)
+            continue
         padded = [np.pad(a, (0, size - length), mode="edge") for a in part]  # equal shapes compile once
         value[start : start + length] = np.asarray(evaluate(result, *padded, wavelength))[:length]
     return value.reshape(*angles[0].shape, num_wavelengths)
+
+
+def host_function(result: Any, wavelength_nm: Float[np.ndarray, " query"] | None):
+    """Return what evaluates a record in lists of directions by NumPy; None where JAX does, as on accelerators.
+
+    Compiling takes longer than thousands of directions of a field or a lobe tensor.
+    """
+    field = getattr(result, "field", result)
+    if jax.default_backend() != "cpu" or not isinstance(field, GuidedField | LobeTensor):
+        return None
+    measured = np.asarray(measured_wavelengths(result), float)
+    outside = None if wavelength_nm is None else outside_range(wavelength_nm, measured)
+    record = jax.tree.map(np.asarray, field)
+
+    def value_of(theta_i, theta_o, phi_o):
+        if isinstance(field, LobeTensor):
+            value = tensor_value(record, theta_i, theta_o, phi_o, wavelength_nm)
+        else:
+            if not getattr(result, "interpolate_theta_i", True):
+                nodes = np.asarray(result.theta_i)
+                theta_i = nodes[np.argmin(np.abs(theta_i[:, None] - nodes), axis=1)]
+            value = evaluate_directions(record, theta_i, theta_o, phi_o)
+            if wavelength_nm is not None:
+                value = value @ spectral_weights(wavelength_nm, measured).T
+        return value if outside is None else np.where(outside, np.nan, value)
+
+    return value_of
 
 
 def numbers_per_direction(result) -> int:
@@ -337,9 +369,8 @@ def evaluate_on_axes(
         value = evaluate_where(result, *axes, np.ones(shape, bool)).reshape(*shape, -1)
         if wavelength_nm is None:
             return value
-        wavelength, measured = jnp.atleast_1d(jnp.asarray(wavelength_nm, float)), jnp.asarray(result.wavelength_nm)
-        value = value @ np.asarray(spectral_weights(wavelength, measured)).T
-        return np.where(np.asarray(outside_range(wavelength, measured)), np.nan, value)
+        wavelength, measured = np.atleast_1d(np.asarray(wavelength_nm, float)), np.asarray(result.wavelength_nm)
+        return np.where(outside_range(wavelength, measured), np.nan, value @ spectral_weights(wavelength, measured).T)
     return evaluate_in_chunks(result, *np.meshgrid(*axes, indexing="ij"), wavelength_nm)
 
 

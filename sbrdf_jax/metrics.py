@@ -314,7 +314,8 @@ def off_node_scores(
     if not result.interpolate_theta_i:
         return share, depth, float("nan")
     backward = evaluate_in_chunks(result, theta_o, theta_i, -phi_o, chunk_size=CHUNK_SIZE)
-    known = (theta_o >= result.theta_i[0]) & (theta_o <= result.theta_i[-1])
+    first, last = np.asarray(result.theta_i)[[0, -1]]
+    known = (theta_o >= first) & (theta_o <= last)
     live = np.isfinite(forward) & np.isfinite(backward) & known[:, None]
     energy = (forward[live] ** 2 + backward[live] ** 2).sum() / 2
     return share, depth, float(relative_error(((forward[live] - backward[live]) ** 2).sum(), energy))

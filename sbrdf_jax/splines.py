@@ -2,10 +2,12 @@
 
 import numpy as np
 
+from sbrdf_jax.array_module import array_module
+
 DEGREE = 3
 
 
-def spline_weights(position, count: int, xp):
+def spline_weights(position, count: int):
     """Return the values of all B-splines of a clamped, uniform knot vector on [0, 1].
 
     De Boor's recursion over all functions at once: they are few. The weights are not negative
@@ -14,12 +16,11 @@ def spline_weights(position, count: int, xp):
     Args:
         position: Where [...], 0 to 1; what lies beyond is clamped.
         count: Number of functions, 1 or more; below 4 the degree is count - 1.
-        xp: numpy or jax.numpy.
 
     Returns:
         Weights [..., count].
     """
-    degree = min(DEGREE, count - 1)
+    xp, degree = array_module(position), min(DEGREE, count - 1)
     knots = np.concatenate([np.zeros(degree), np.linspace(0, 1, count - degree + 1), np.ones(degree)])
     x = xp.clip(position, 0.0, 1.0)[..., None]
     shape = (1,) * (x.ndim - 1) + (-1,)

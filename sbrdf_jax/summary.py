@@ -110,7 +110,7 @@ def done_table(result: RunResult) -> Table:
     if not grid.interpolate_theta_i:
         rows.append(("", "theta_i as measured, nothing interpolated over it"))
     residual = np.asarray(grid.kkt_residual, float)
-    residual, steps = np.max(residual[np.isfinite(residual)], initial=0.0), int(np.max(grid.num_steps))
+    residual, steps = np.max(residual[np.isfinite(residual)], initial=0.0), int(np.max(np.asarray(grid.num_steps)))
     certificate = f"KKT residual at most {residual:.1e}, at most {steps} steps"
     rows.append(("solver", f"{certificate}; {count_statuses(grid.status)}"))
     rows.append(("nodes", coverage_text(grid.extrapolated)))

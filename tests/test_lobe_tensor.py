@@ -69,10 +69,10 @@ def test_splines_are_those_of_scipy(count, rng):
     degree = min(3, count - 1)
     knots = np.concatenate([np.zeros(degree), np.linspace(0, 1, count - degree + 1), np.ones(degree)])
     expected = BSpline.design_matrix(position, knots, degree).toarray()
-    np.testing.assert_allclose(spline_weights(position, count, np), expected, rtol=0, atol=ROUND)
-    np.testing.assert_allclose(spline_weights(jnp.asarray(position), count, jnp), expected, rtol=0, atol=ROUND)
-    beyond = spline_weights(np.array([-0.5, 1.5]), count, np)
-    np.testing.assert_allclose(beyond, spline_weights(np.array([0.0, 1.0]), count, np), rtol=0, atol=0)
+    np.testing.assert_allclose(spline_weights(position, count), expected, rtol=0, atol=ROUND)
+    np.testing.assert_allclose(spline_weights(jnp.asarray(position), count), expected, rtol=0, atol=ROUND)
+    beyond = spline_weights(np.array([-0.5, 1.5]), count)
+    np.testing.assert_allclose(beyond, spline_weights(np.array([0.0, 1.0]), count), rtol=0, atol=0)
 
 
 def test_direction_functions_know_no_azimuth_at_the_poles_and_are_finite_at_grazing(rng):
@@ -80,12 +80,12 @@ def test_direction_functions_know_no_azimuth_at_the_poles_and_are_finite_at_graz
     phi = rng.uniform(0, 6, 5)
     zero, other = np.zeros(5), np.full(5, 0.7)
     for theta_i, theta_o in ((zero, other), (other, zero)):
-        found = direction_functions(theta_i, theta_o, phi, floor, np)
+        found = direction_functions(theta_i, theta_o, phi, floor)
         assert found.shape == (5, num_direction_functions(floor))
         assert np.abs(found - found[:1]).max() < ROUND
     grazing, mirror = np.full(1, np.pi / 2), np.full(1, np.pi)
-    found = direction_functions(grazing, grazing, mirror, floor, np)
-    expected = direction_functions(np.full(1, 0.3), np.full(1, 0.3), mirror, floor, np)  # half angle 0 alike
+    found = direction_functions(grazing, grazing, mirror, floor)
+    expected = direction_functions(np.full(1, 0.3), np.full(1, 0.3), mirror, floor)  # half angle 0 alike
     assert np.abs(found - expected)[0, :-3].max() < ROUND
 
 

@@ -220,16 +220,14 @@ def measure_samples(samples: RawSamples, grid: GriddedBRDF) -> list[CutoffSpectr
             window="none",
         )
         residual = value - evaluate_in_chunks(fitted, samples.theta_i, samples.theta_o, samples.phi_o)
-    steps = [float(axis[1] - axis[0]) for axis in (grid.theta_o, grid.phi_o)]
+    steps = [float(np.diff(axis[:2])[0]) for axis in map(np.asarray, (grid.theta_o, grid.phi_o))]
     return measure_cutoff(
         samples.theta_i,
         samples.theta_o,
         samples.phi_o,
         value,
         residual=residual,
-        theta_i_step=float(grid.theta_i[1] - grid.theta_i[0])
-        if np.size(grid.theta_i) > 1 and grid.interpolate_theta_i
-        else 0.0,
+        theta_i_step=float(np.diff(np.asarray(grid.theta_i)[:2]).sum()) if grid.interpolate_theta_i else 0.0,
         theta_o_step=steps[0],
         phi_o_step=steps[1],
     )

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from sbrdf_jax.array_module import array_module
 from sbrdf_jax.splines import spline_weights
 
 AZIMUTH_FUNCTIONS = 3
@@ -21,8 +22,8 @@ def num_direction_functions(floor: float) -> int:
     return round(np.log1p(1 / floor) / SPLINE_SPACING) + 3 + AZIMUTH_FUNCTIONS
 
 
-def direction_functions(theta_i, theta_o, phi_o, floor: float, xp):
-    """Evaluate all functions at directions [..., function], by NumPy or JAX as `xp`.
+def direction_functions(theta_i, theta_o, phi_o, floor: float):
+    """Evaluate all functions at directions [..., function].
 
     Cubic B-splines, even in log(sin^2 theta_h + floor) with theta_h the half angle: lobes of all
     widths, wherever their peak is. Then (sin theta_i sin theta_o)^k cos(k phi_o), k from 1. All are
@@ -33,14 +34,14 @@ def direction_functions(theta_i, theta_o, phi_o, floor: float, xp):
         theta_o: Polar angle of exitance [rad].
         phi_o: Azimuth of exitance [rad].
         floor: From `half_angle_floor`.
-        xp: numpy or jax.numpy.
     """
+    xp = array_module(theta_i, theta_o, phi_o)
     sin_i, sin_o, cos_phi = xp.sin(theta_i), xp.sin(theta_o), xp.cos(phi_o)
     across = sin_i**2 + sin_o**2 + 2 * sin_i * sin_o * cos_phi  # of the half vector, squared
     along = (xp.cos(theta_i) + xp.cos(theta_o)) ** 2
     sin_squared = xp.maximum(across, 0.0) / (xp.maximum(across, 0.0) + along + OPPOSITE)
     low, high = np.log(floor), np.log1p(floor)
     count = num_direction_functions(floor) - AZIMUTH_FUNCTIONS
-    splines = spline_weights((xp.log(sin_squared + floor) - low) / (high - low), count, xp)
+    splines = spline_weights((xp.log(sin_squared + floor) - low) / (high - low), count)
     waves = [(sin_i * sin_o) ** k * xp.cos(k * phi_o) for k in range(1, AZIMUTH_FUNCTIONS + 1)]
     return xp.concatenate([splines, xp.stack(waves, axis=-1)], axis=-1)

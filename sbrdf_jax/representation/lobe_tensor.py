@@ -131,10 +131,10 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
     columns = np.unique(np.concatenate([block.theta_o for block in half.blocks]))
     if field.interpolate_theta_i:
         low, high = half.nodes.theta_i[[0, -1]]
-        at_rows = spline_weights((rows - low) / (high - low if high > low else 1.0), layout.functions[0], np)
+        at_rows = spline_weights((rows - low) / (high - low if high > low else 1.0), layout.functions[0])
     else:
         at_rows = np.eye(layout.functions[0])[place]
-    at_columns = spline_weights(columns * (2 / np.pi), layout.functions[1], np)
+    at_columns = spline_weights(columns * (2 / np.pi), layout.functions[1])
 
     energy = np.einsum("iopw,iopw->i", half.nodes.brdf, half.nodes.brdf)
     scaled = np.flatnonzero(energy > 0)
@@ -216,7 +216,7 @@ class _Seen(NamedTuple):
 def _functions(theta_i, theta_o, phi_o, floor) -> Float[np.ndarray, "o p function"]:
     """Return the directional functions of one incident angle at every combination of two axes."""
     mesh = np.meshgrid(theta_o, phi_o, indexing="ij")
-    return direction_functions(np.full(mesh[0].shape, theta_i), *mesh, floor, np)
+    return direction_functions(np.full(mesh[0].shape, theta_i), *mesh, floor)
 
 
 def channels_of(basis: SpectralBasis, half: HalfField) -> tuple[np.ndarray, np.ndarray]:

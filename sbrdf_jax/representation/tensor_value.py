@@ -2,11 +2,10 @@
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from sbrdf_jax.array_module import AnyArray, array_module
 from sbrdf_jax.encoding import decode
 from sbrdf_jax.records import LobeTensor
 from sbrdf_jax.representation.direction_functions import direction_functions
@@ -35,35 +34,39 @@ def pad_ranks(tensor: LobeTensor) -> LobeTensor:
 
 def tensor_value(
     tensor: LobeTensor,
-    theta_i: Float[Array, ""],
-    theta_o: Float[Array, ""],
-    phi_o: Float[Array, ""],
-    wavelength_nm: Float[Array, " query"] | None = None,
-) -> Float[Array, " wavelength"]:
-    """Evaluate a lobe tensor in one direction [1/sr].
+    theta_i: Float[AnyArray, "*shape"],
+    theta_o: Float[AnyArray, "*shape"],
+    phi_o: Float[AnyArray, "*shape"],
+    wavelength_nm: Float[AnyArray, " query"] | None = None,
+) -> Float[AnyArray, "*shape wavelength"]:
+    """Evaluate a lobe tensor in directions of any common shape [1/sr].
 
     Never negative, because it is clipped at 0; finite everywhere, and independent of phi_o
     where theta_i or theta_o is 0. Between incident angles the factors are cubic splines and the
     scale is one in its logarithm; beyond those with data they are the factors of the last one.
     """
+    xp, shape = array_module(theta_i, tensor.core), np.shape(theta_i)
     along_i = theta_i_functions(tensor, theta_i)
-    at_i = along_i @ jnp.asarray(tensor.theta_i_factor)
-    count_o = tensor.theta_o_factor.shape[0]
-    at_o = spline_weights(theta_o * (2 / np.pi), count_o, jnp) @ jnp.asarray(tensor.theta_o_factor)
-    functions = direction_functions(theta_i, theta_o, phi_o, tensor.half_angle_floor, jnp)
-    at_direction = functions @ jnp.asarray(tensor.direction_factor)
-    amplitude = jnp.tensordot(at_i, jnp.asarray(tensor.core), 1)
-    coefficient = at_direction @ jnp.tensordot(at_o, amplitude, 1)
-    scale = jnp.exp(-along_i @ jnp.asarray(tensor.log_scale))
-    return jnp.maximum(decode(coefficient * scale, tensor.basis, wavelength_nm), 0.0)
+    at_i = along_i @ tensor.theta_i_factor
+    at_o = spline_weights(theta_o * (2 / np.pi), tensor.theta_o_factor.shape[0]) @ tensor.theta_o_factor
+    at_direction = direction_functions(theta_i, theta_o, phi_o, tensor.half_angle_floor) @ tensor.direction_factor
+    _, rank_o, rank_direction, _ = tensor.core.shape
+    amplitude = xp.tensordot(at_i, tensor.core, 1).reshape(*shape, rank_o, -1)
+    amplitude = (at_o[..., None, :] @ amplitude).reshape(*shape, rank_direction, -1)
+    coefficient = (at_direction[..., None, :] @ amplitude)[..., 0, :]
+    scale = xp.exp(-along_i @ tensor.log_scale)
+    return xp.maximum(decode(coefficient * scale[..., None], tensor.basis, wavelength_nm), 0.0)
 
 
-def theta_i_functions(tensor: LobeTensor, theta_i: Float[Array, ""]) -> Float[Array, " theta_i_function"]:
+def theta_i_functions(
+    tensor: LobeTensor, theta_i: Float[AnyArray, "*shape"]
+) -> Float[AnyArray, "*shape theta_i_function"]:
     """Return the splines of theta_i; where nothing is interpolated over it, 1 at the nearest node."""
-    count = tensor.theta_i_factor.shape[0]
+    xp, count = array_module(theta_i, tensor.theta_i), tensor.theta_i_factor.shape[0]
     if not tensor.interpolate_theta_i:
-        nodes = jnp.asarray(tensor.theta_i)
-        return jax.nn.one_hot(jnp.argmin(jnp.abs(theta_i - nodes)), count, dtype=nodes.dtype)
-    low, high = jnp.asarray(tensor.theta_i_range)
-    width = jnp.where(high > low, high - low, 1.0)  # one incident angle alone: its factors everywhere
-    return spline_weights((theta_i - low) / width, count, jnp)
+        nodes = tensor.theta_i.reshape((1,) * np.ndim(theta_i) + (-1,))
+        nearest = xp.argmin(xp.abs(theta_i[..., None] - nodes), axis=-1)
+        return xp.eye(count, dtype=tensor.theta_i.dtype)[nearest]
+    low, high = tensor.theta_i_range
+    width = xp.where(high > low, high - low, 1.0)  # one incident angle alone: its factors everywhere
+    return spline_weights((theta_i - low) / width, count)

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 from jaxtyping import Array, Float
 
 from sbrdf_jax.array_module import AnyArray, array_module
@@ -98,6 +99,29 @@ def _log_value(field: GuidedField, at: Coordinates):
     for name, axes in GRIDS.items():
         z = z + interpolate(getattr(field, name), (getattr(at, name), at.theta_i, at.theta_o), axes)
     return z
+
+
+def evaluate_directions(
+    field: GuidedField,
+    theta_i: Float[np.ndarray, " direction"],
+    theta_o: Float[np.ndarray, " direction"],
+    phi_o: Float[np.ndarray, " direction"],
+) -> Float[np.ndarray, "direction wavelength"]:
+    """`evaluate_direction` of many directions on the host: the nodes around each are a row of a sparse matrix."""
+    at = guided_coordinates(theta_i, theta_o, phi_o, field.theta_limit)
+    z = lobe_log_value(field.lobe, at, field.floor)
+    for name, axes in GRIDS.items():
+        nodes, index, product = getattr(field, name), 0, 1.0
+        places = getattr(at, name), at.theta_i, at.theta_o
+        for k, (x, axis) in enumerate(zip(places, axes, strict=True)):
+            first, weight = cubic_weights(x, axis)
+            shape = (-1, *(4 if k == j else 1 for j in range(3)))
+            index = index * nodes.shape[k] + (first[:, None] + np.arange(4)).reshape(shape)
+            product = product * weight.reshape(shape)
+        start = np.arange(0, product.size + 1, 4**3)
+        rows = scipy.sparse.csr_array((product.ravel(), index.ravel(), start), (len(theta_i), np.prod(nodes.shape[:3])))
+        z = z + rows @ nodes.reshape(-1, nodes.shape[3])
+    return from_log(z, log_scale(at, field.floor))
 
 
 def each_direction(function: Callable[[Any], Array], directions: Any, num_wavelengths: int) -> Array:
