@@ -165,9 +165,11 @@ def lobe_half_width(theta_i: float, theta_o: np.ndarray, phi_o: np.ndarray, valu
     order = np.argsort(alpha, kind="stable")
     alpha, above = alpha[order], (value[order] - background) / (value[peak] - background)
     # the peak alone, then medians of five neighbours in distance: a single spike stays a spike
-    middle = np.arange(3, len(alpha) - 2)
-    profile = np.concatenate([above[:1], [np.median(above[k - 2 : k + 3]) for k in middle]])
-    radius = np.concatenate([alpha[:1], alpha[middle]])
+    if len(alpha) < 6:
+        return np.nan
+    windows = np.lib.stride_tricks.sliding_window_view(above[1:], 5)
+    profile = np.append(above[:1], np.median(windows, axis=1))
+    radius = np.append(alpha[:1], alpha[3 : len(windows) + 3])
     below = np.flatnonzero(profile < 0.5)
     if not len(below):
         return np.nan

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import h5py
-import jax.numpy as jnp
 import numpy as np
 
 from sbrdf_jax.cleaning import CleanEntry, CleanReport, Flag
@@ -187,7 +186,7 @@ def read_guided(group: h5py.Group, lanes: np.ndarray | slice = _EVERY) -> Guided
     parts["variance"] = dataclasses.replace(variance, reciprocal=bool(variance.reciprocal))
     names = {f.name for f in dataclasses.fields(GuidedField)}
     plain = {name: np.asarray(value) for name, value in stored.items() if name in names}
-    nodes = {name: mirror(jnp.asarray(plain.pop(name))) for name in GRIDS}
+    nodes = {name: mirror(plain.pop(name)) for name in GRIDS}
     return GuidedField(**plain, **parts, **angles, **nodes)
 
 

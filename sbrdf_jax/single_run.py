@@ -71,6 +71,6 @@ def run_to_file(
         from sbrdf_jax.report import write_page
 
         with progress.stage("report"):
-            page = write_page([(output.stem, result)], output.with_name(f"{output.stem}_report"), raw)
+            page = write_page([(output.stem, result)], output.with_name(f"{output.stem}_report"), ready.cleaned.samples)
             progress.update(str(page))
     return result

@@ -55,14 +55,14 @@ details pre { overflow-x: auto; font-size: .85rem; }
 
 
 def write_page(
-    results: Sequence[tuple[str, RunResult]], folder: str | os.PathLike[str], raw: RawSamples | None = None
+    results: Sequence[tuple[str, RunResult]], folder: str | os.PathLike[str], samples: RawSamples | None = None
 ) -> Path:
     """Write the figures of one or more results and a page that shows them.
 
     Args:
         results: Name and result of each.
         folder: Where index.html and the figures go; made if it is absent.
-        raw: The measurement of a single result, as read; otherwise each source is read again where it is unchanged.
+        samples: The cleaned samples of a single result; without them each source is read again where it is unchanged.
 
     Returns:
         The page.
@@ -77,8 +77,8 @@ def write_page(
         raise UserError(f"{folder}: cannot be made: {error.strerror}, expected a folder for the report") from error
     sections, names = [], unique_names([name for name, _ in results])
     for name, (_, result) in zip(names, results, strict=True):
-        samples, missing = cleaned_samples(result, raw if len(results) == 1 else None)
-        drawings = draw(result, folder, samples, prefix=f"{name}_" if len(results) > 1 else "")
+        shown, missing = (samples, "") if samples is not None and len(results) == 1 else cleaned_samples(result)
+        drawings = draw(result, folder, shown, prefix=f"{name}_" if len(results) > 1 else "")
         sections.append(section(name, result, drawings, missing))
     page = folder / "index.html"
     with whole_file(page) as temporary:
@@ -98,16 +98,15 @@ def unique_names(names: Sequence[str]) -> list[str]:
     return found
 
 
-def cleaned_samples(result: RunResult, raw: RawSamples | None) -> tuple[RawSamples | None, str]:
+def cleaned_samples(result: RunResult) -> tuple[RawSamples | None, str]:
     """Return the cleaned samples behind a result, or None and a sentence that says why there are none."""
     if not result.config:
         return None, "The result holds no config, so its samples are not shown."
     options = parse_config(result.config, name="config of the result")
-    if raw is None:
-        try:
-            raw = read(options.input.path, options.input)
-        except UserError as error:
-            return None, f"The samples are not shown, because their source cannot be read: {error}"
+    try:
+        raw = read(options.input.path, options.input)
+    except UserError as error:
+        return None, f"The samples are not shown, because their source cannot be read: {error}"
     if raw.source_sha256 != result.source_sha256:
         return None, f"The samples are not shown, because {options.input.path} has changed since the result was made."
     return clean(raw, bilateral=options.input.bilateral, method=options.resample.method).samples, ""

@@ -16,6 +16,7 @@ INK, MUTED, FAINT, PAPER = "#1f2328", "#6b7280", "#d7dbe0", "#ffffff"
 SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 LINES = ("-", (0, (5, 1.6)), (0, (1.4, 1.2)), (0, (6, 1.5, 1.2, 1.5)), "-", (0, (5, 1.6)))
 DPI = 144
+MANY_DECADES = 1e3
 
 _RC: Any = {
     "font.size": 10.5,
@@ -41,7 +42,7 @@ _RC: Any = {
     "lines.linewidth": 1.9,
     "legend.frameon": False,
     "legend.fontsize": 9.5,
-    "savefig.facecolor": PAPER,
+    "figure.facecolor": PAPER,
 }
 
 
@@ -65,11 +66,22 @@ def new_figure(width: float = 7.6, height: float = 4.2) -> Any:
 
 def save_figure(figure: Any, path: Path) -> Path:
     """Write a figure as PNG and return its path; the same figure gives the same bytes."""
+    for axes in figure.axes:
+        _thin_out(axes)
     figure.get_layout_engine().execute(figure)
-    figure.set_layout_engine("none")  # savefig would lay out and draw everything twice
-    with whole_file(path) as temporary:
-        figure.savefig(temporary, format="png", metadata={"Software": None})
+    figure.set_layout_engine("none")
+    with whole_file(path) as temporary:  # savefig would lay out and draw everything twice
+        figure.canvas.print_png(temporary, metadata={"Software": None}, pil_kwargs={"compress_level": 3})
     return path
+
+
+def _thin_out(axes: Any) -> None:
+    """Leave out the minor ticks of a logarithmic axis of many decades: they say nothing, and take half of the time."""
+    from matplotlib.ticker import NullLocator
+
+    low, high = axes.get_ylim()
+    if axes.get_yscale() == "log" and high > MANY_DECADES * low:
+        axes.yaxis.set_minor_locator(NullLocator())
 
 
 def plane_axis(axes: Any) -> None:

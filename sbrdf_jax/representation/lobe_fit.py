@@ -4,9 +4,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from sbrdf_jax.records import Status
@@ -80,6 +78,9 @@ def fit_lobe(
         the solver says of itself is not believed: at the rounding level it rejects steps until
         it runs out of them, so the status follows from the gradient.
     """
+    import lineax as lx  # half a second that most runs need not wait for
+    import optimistix as optx
+
     narrowest, widest = jnp.log(width_range[0]), jnp.log(width_range[1])
     root_weight = RESIDUAL_SCALE * jnp.sqrt(jnp.where(inside, weight, 0.0))
     weighted_target = root_weight * target
