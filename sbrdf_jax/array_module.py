@@ -16,4 +16,7 @@ AnyArray = np.ndarray | np.generic | jax.Array  # a scalar of NumPy is no array 
 
 def array_module(*arrays: Any) -> ModuleType:
     """Return `jax.numpy` if any of the arrays is JAX's or is being traced, else NumPy."""
-    return jnp if any(isinstance(a, jax.Array) for a in arrays) else np
+    for array in arrays:  # asking what is JAX's takes longer
+        if not isinstance(array, np.ndarray | np.generic | float | int) and isinstance(array, jax.Array):
+            return jnp
+    return np

@@ -61,6 +61,11 @@ def colour_matching(
     Raises:
         ValueError: the observer or the illuminant is unknown.
     """
+    return _colour_matching(tuple(np.asarray(wavelength_nm, float).tolist()), observer, illuminant)
+
+
+@functools.lru_cache(maxsize=16)
+def _colour_matching(wavelength_nm: tuple[float, ...], observer: str, illuminant: str) -> ColourMatching:
     if observer not in OBSERVERS:
         raise ValueError(f"observer {observer!r} is unknown; it is {' or '.join(OBSERVERS)}")
     if illuminant not in illuminants():

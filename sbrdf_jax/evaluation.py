@@ -22,7 +22,7 @@ from sbrdf_jax.interpolation import outside_range, spectral_weights
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, SpectralField
 from sbrdf_jax.representation.lobe_harmonics_value import lobe_harmonics_value, pad_coefficients
 from sbrdf_jax.representation.paper import compact_coefficient
-from sbrdf_jax.representation.tensor_value import pad_ranks, tensor_value
+from sbrdf_jax.representation.tensor_value import pad_ranks, tensor_on_axes, tensor_value
 from sbrdf_jax.resampling.guided.field import (
     GuidedField,
     each_direction,
@@ -391,15 +391,16 @@ def evaluate_where(
     axes = [np.asarray(a, float) for a in (theta_i, theta_o, phi_o)]
     if isinstance(result, GriddedBRDF) and field is None:
         return evaluate_on_axes(result, *axes)[where]
-    if not isinstance(field, GuidedField) or not where.any():
+    gains = isinstance(field, GuidedField) or (isinstance(field, LobeTensor) and jax.default_backend() == "cpu")
+    if not gains or not where.any():
         directions = (mesh[where] for mesh in np.meshgrid(*axes, indexing="ij"))
         return evaluate_in_chunks(result, *directions, chunk_size=chunk_size)
     nodes = None if getattr(result, "interpolate_theta_i", True) else np.asarray(result.theta_i)
     value: list[np.ndarray] = []
-    field = evaluated_part(field)
+    along, part = (tensor_on_axes, field) if isinstance(field, LobeTensor) else (field_on_axes, evaluated_part(field))
     for i in np.flatnonzero(where.any(axis=(1, 2))):
         angle = axes[0][i] if nodes is None else nodes[np.argmin(np.abs(axes[0][i] - nodes))]
-        row = functools.partial(on_host(field_on_axes), field, angle)
+        row = functools.partial(on_host(along), part, angle)
         value += on_axes(lambda *at, row=row: (row(*at),), *axes[1:], where[i])
     return np.concatenate(value)
 

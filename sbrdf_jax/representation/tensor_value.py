@@ -34,28 +34,35 @@ def pad_ranks(tensor: LobeTensor) -> LobeTensor:
 
 def tensor_value(
     tensor: LobeTensor,
-    theta_i: Float[AnyArray, "*shape"],
-    theta_o: Float[AnyArray, "*shape"],
-    phi_o: Float[AnyArray, "*shape"],
+    theta_i: Float[AnyArray, "*#shape"],
+    theta_o: Float[AnyArray, "*#shape"],
+    phi_o: Float[AnyArray, "*#shape"],
     wavelength_nm: Float[AnyArray, " query"] | None = None,
 ) -> Float[AnyArray, "*shape wavelength"]:
-    """Evaluate a lobe tensor in directions of any common shape [1/sr].
+    """Evaluate a lobe tensor in directions whose angles broadcast [1/sr]; what depends on few angles is summed once.
 
     Never negative, because it is clipped at 0; finite everywhere, and independent of phi_o
     where theta_i or theta_o is 0. Between incident angles the factors are cubic splines and the
     scale is one in its logarithm; beyond those with data they are the factors of the last one.
     """
-    xp, shape = array_module(theta_i, tensor.core), np.shape(theta_i)
+    xp, polar = array_module(theta_i, tensor.core), np.broadcast_shapes(np.shape(theta_i), np.shape(theta_o))
     along_i = theta_i_functions(tensor, theta_i)
     at_i = along_i @ tensor.theta_i_factor
     at_o = spline_weights(theta_o * (2 / np.pi), tensor.theta_o_factor.shape[0]) @ tensor.theta_o_factor
     at_direction = direction_functions(theta_i, theta_o, phi_o, tensor.half_angle_floor) @ tensor.direction_factor
     _, rank_o, rank_direction, _ = tensor.core.shape
-    amplitude = xp.tensordot(at_i, tensor.core, 1).reshape(*shape, rank_o, -1)
-    amplitude = (at_o[..., None, :] @ amplitude).reshape(*shape, rank_direction, -1)
+    amplitude = xp.tensordot(at_i, tensor.core, 1).reshape(*np.shape(theta_i), rank_o, -1)
+    amplitude = (at_o[..., None, :] @ amplitude).reshape(*polar, rank_direction, -1)
     coefficient = (at_direction[..., None, :] @ amplitude)[..., 0, :]
     scale = xp.exp(-along_i @ tensor.log_scale)
     return xp.maximum(decode(coefficient * scale[..., None], tensor.basis, wavelength_nm), 0.0)
+
+
+def tensor_on_axes(
+    tensor: LobeTensor, theta_i: Float[AnyArray, ""], theta_o: Float[AnyArray, " o"], phi_o: Float[AnyArray, " p"]
+) -> Float[AnyArray, "o p wavelength"]:
+    """`tensor_value` at all combinations of two axes, at one incident angle."""
+    return tensor_value(tensor, theta_i.reshape(1, 1), theta_o[:, None], phi_o[None, :])
 
 
 def theta_i_functions(

@@ -132,7 +132,8 @@ def resample_guided(
     fit = fit_field(samples, options, report, centres, needed=needs.wavelength, estimates=estimates, known=earlier)
     if report is not None:
         report("nodes")
-    nodes = read_nodes(fit.field, grid, fit.whiten, needs.node, known, estimates.node_variance)
+    held = estimates.node_variance, centres.node_covariance
+    nodes = read_nodes(fit.field, grid, fit.whiten, needs.node, known, *held)
     theta_i = needs.theta_i
     return GriddedBRDF(
         theta_i=jnp.asarray(grid.theta_i[theta_i]),

@@ -39,6 +39,7 @@ class Centres:
     theta_limit: np.ndarray  # [2] rad
     features: GroupedFeatures
     reciprocal: bool  # nodes are tied by Helmholtz reciprocity
+    node_covariance: dict[bytes, tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)  # by grid
     _prior: dict[int, tuple[ModeVariance, np.ndarray]] = dataclasses.field(default_factory=dict)
     _inverse: dict[tuple[int, float], np.ndarray] = dataclasses.field(default_factory=dict)
 

@@ -18,6 +18,7 @@ from sbrdf_jax.resampling.guided.on_axes import on_axes
 
 SAME_ANGLE = 1e-9  # rad; degrees in a file and back are not exact
 MOST_PENDING = 4096  # directions whose covariances with all centres are held at a time
+Covariances = tuple[np.ndarray, np.ndarray]  # prior ones [direction, centre], and prior variances [direction]
 
 
 class NodeValues(NamedTuple):
@@ -35,6 +36,7 @@ def read_nodes(
     node: np.ndarray | None = None,
     known: GriddedBRDF | None = None,
     variances: dict[bytes, np.ndarray] | None = None,
+    covariances: dict[bytes, Covariances] | None = None,
 ) -> NodeValues:
     """Return the field and its standard error at the grid's nodes.
 
@@ -47,6 +49,7 @@ def read_nodes(
         node: Mask [theta_i, theta_o, phi_o inclusive] of the nodes that are needed; None: all.
         known: An earlier answer, of which what is needed is taken over.
         variances: Variances of z that other wavelengths have asked for, by grid; new ones are added.
+        covariances: Of the nodes that the last material of these centres asked for, by grid; renewed.
     """
     shape = (len(grid.theta_i), len(grid.theta_o), grid.num_azimuths)
     half = np.ones(shape, bool) if node is None else node[:, :, : grid.num_azimuths]
@@ -57,7 +60,9 @@ def read_nodes(
     fresh, lanes = half, np.ones(len(field.wavelength_nm), bool)
     if known is not None and known_rows(known, grid) is not None:
         fresh, lanes = _take_known(value, variance, half, grid, np.asarray(field.wavelength_nm), known)
-    _add_variances(variance, half & np.isnan(variance), field, whiten, grid.theta_i, axes)
+    missing = half & np.isnan(variance)
+    covariances = {} if covariances is None else covariances
+    _add_variances(variance, missing, field, whiten, grid.theta_i, axes, covariances, key + missing.tobytes())
     for nodes, columns in ((fresh, np.arange(len(lanes))), (half & ~fresh, np.flatnonzero(lanes))):
         rows = np.flatnonzero(nodes.any(axis=(1, 2)))
         if not len(columns) or not len(rows):
@@ -74,21 +79,31 @@ def read_nodes(
     return NodeValues(value[0], value[1], known_variance)
 
 
-def _add_variances(variance: np.ndarray, missing: np.ndarray, field: GuidedField, whiten, theta_i, axes) -> None:
-    """Work out the variances that are missing, once for each distinct direction: poles have many azimuths."""
+def _add_variances(
+    variance: np.ndarray, missing: np.ndarray, field: GuidedField, whiten, theta_i, axes, covariances, key: bytes
+) -> None:
+    """Work out the variances that are missing, once for each distinct direction: poles have many azimuths.
+
+    Covariances depend on angles and the prior alone; of few enough directions they are held for the next material.
+    """
     prior = field.variance, field.centre, field.theta_limit
-    pending: list[tuple[np.ndarray, np.ndarray]] = []
+    pending: list[Covariances] = [covariances[key]] if key in covariances else []
     flushed: list[np.ndarray] = []
     distinct = missing.copy()
     isotropic = (theta_i[:, None] == 0) | (axes[0] == 0)
     distinct[isotropic] = False
     distinct[..., 0] |= isotropic & missing.any(axis=2)
-    for i in np.flatnonzero(distinct.any(axis=(1, 2))):
+    rows = [] if pending else np.flatnonzero(distinct.any(axis=(1, 2)))
+    for i in rows:
         pending.append(on_axes(functools.partial(on_host(covariance_on_axes), *prior, theta_i[i]), *axes, distinct[i]))
         if sum(len(part[1]) for part in pending) >= MOST_PENDING:
             flushed.append(_unexplained(pending, whiten))
             pending = []
     if pending:
+        if not flushed:
+            covariances.clear()  # they take up to 52 MB
+            covariances[key] = tuple(np.concatenate(arrays) for arrays in zip(*pending, strict=True))
+            pending = [covariances[key]]
         flushed.append(_unexplained(pending, whiten))
     if flushed:
         found = np.full(variance.shape, np.nan)
@@ -97,7 +112,7 @@ def _add_variances(variance: np.ndarray, missing: np.ndarray, field: GuidedField
         variance[missing] = found[missing]
 
 
-def _unexplained(parts: list[tuple[np.ndarray, np.ndarray]], whiten: np.ndarray) -> np.ndarray:
+def _unexplained(parts: list[Covariances], whiten: np.ndarray) -> np.ndarray:
     """`field.unexplained` of covariances and prior variances, on the host: BLAS multiplies by a triangle as such."""
     cross, prior = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     with one_blas_thread():
