@@ -46,6 +46,7 @@ from sbrdf_jax.resampling.guided.error_model import MAX_FACTOR, estimate_floor, 
 from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out, lower_inverse, mirror_lower
 from sbrdf_jax.resampling.guided.lobe_fit import fit_lobe_model
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value, lobe_terms
+from sbrdf_jax.resampling.guided.lobe_slopes import lobe_slopes
 from sbrdf_jax.resampling.guided.merging import merge_samples
 from sbrdf_jax.resampling.guided.nodes import GRIDS, interpolate, mirror, mode_variance
 from sbrdf_jax.resampling.guided.smoothing import CONSTANT, PRIOR
@@ -240,6 +241,15 @@ def test_lobe_model_recovers_planted_amplitudes(rng):
     found, gradient = fit_lobe_model(value, z, at, np.ones(num), floor)
     assert np.sqrt(np.mean((lobe_log_value(found, at, floor) - z) ** 2)) < 0.02
     assert gradient.shape == (2,) and float(gradient.max()) < 0.2
+
+
+def test_lobe_slopes_are_the_derivatives_of_the_terms(rng):
+    theta_i, theta_o, phi = random_directions(rng, 60)
+    near_mirror = theta_o.at[:9].set(theta_i[:9]), phi.at[:9].set(3.13)
+    at = jax.tree.map(np.asarray, guided_coordinates(theta_i, *near_mirror, LIMIT))
+    shape = np.array([-0.7, np.log(0.02), np.log(0.08), np.log(0.3), 1.1, 0.9, 0.8, 0.7, 0.5])
+    expected = jax.jacobian(lobe_terms)(jnp.asarray(shape), jax.tree.map(jnp.asarray, at))
+    np.testing.assert_allclose(lobe_slopes(shape, at), np.transpose(expected, (2, 1, 0)), rtol=1e-7, atol=1e-9)
 
 
 def test_lobe_terms_are_finite_at_the_edges():

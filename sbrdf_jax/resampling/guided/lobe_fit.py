@@ -12,6 +12,7 @@ from jaxtyping import Float
 from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.resampling.guided.coordinates import Coordinates, log_scale
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_terms
+from sbrdf_jax.resampling.guided.lobe_slopes import lobe_slopes
 
 NUM_TERMS = 4  # diffuse, mirror, narrow lobe, broad lobe
 NUM_FIT_WAVELENGTHS = 8  # the shared shape is fitted to about so many
@@ -27,7 +28,6 @@ DENSITY_WIDTH = 0.2  # Gaussian width in log(theta_h[deg] + 1) of the sample den
 SHAPE_STEPS, AMPLITUDE_STEPS = 30, 25
 STOP, AMPLITUDE_STOP = 1e-5, 1e-8  # relative decrease of the loss
 MOST_DAMPING, LEAST_DAMPING = 1e6, 1e-6
-DIFFERENCE = 1e-5  # of a shape parameter, for central differences
 
 
 class _Problem(NamedTuple):
@@ -139,10 +139,8 @@ def _fit_shape(problem: _Problem, log_amplitude: np.ndarray) -> Float[np.ndarray
     for _ in range(SHAPE_STEPS):
         if fresh:
             parts = np.exp(log_amplitude)[:, :, None] * lobe_terms(shape, problem.at).T
-            steps = DIFFERENCE * np.eye(len(shape))
-            change = [lobe_terms(shape + h, problem.at) - lobe_terms(shape - h, problem.at) for h in steps]
-            by_shape = np.stack(change) / (2 * DIFFERENCE)  # [shape, sample, term]
-            shared = np.einsum("snt,mt->msn", by_shape, np.exp(log_amplitude)) * slope[:, None, :]
+            shared = np.exp(log_amplitude) @ lobe_slopes(shape, problem.at)  # [shape, wavelength, sample]
+            shared = np.swapaxes(shared, 0, 1) * slope[:, None, :]
             jacobian = np.concatenate([parts * slope[:, None, :], shared], axis=1)
             whole, pull = _normal(jacobian, _robust(problem, residual), residual)
             corner = whole[:, NUM_TERMS:, NUM_TERMS:].sum(axis=0) + np.diag(pull_of_prior)

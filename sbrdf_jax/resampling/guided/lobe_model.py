@@ -38,6 +38,12 @@ def fresnel(cos, index):
     return (senkrecht**2 + parallel**2) / 2
 
 
+def log_shadowing(width, cos):
+    """Logarithm of Smith's G1 of a GGX lobe over the cosine: 2 / ((1 + sqrt(1 + width^2 tan^2)) cos)."""
+    xp = array_module(width, cos)
+    return xp.log(2 / ((1 + xp.sqrt(1 + width**2 * (1 - cos**2) / cos**2)) * cos))
+
+
 def lobe_terms(shape: Float[AnyArray, " 9"], at: Coordinates) -> Float[AnyArray, "*shape 4"]:
     """Return the four terms at amplitude 1, finite everywhere; Fresnel factors are 1 at normal incidence.
 
@@ -57,8 +63,7 @@ def lobe_terms(shape: Float[AnyArray, " 9"], at: Coordinates) -> Float[AnyArray,
     for k, fresnel_power, shadowing_power in ((1, shape[4], shape[5]), (2, shape[6], shape[7])):
         shadowing = xp.zeros_like(cos_i)
         for cos in (cos_i, cos_o):
-            root = xp.sqrt(1 + width[k] ** 2 * (1 - cos**2) / cos**2)
-            shadowing = shadowing + xp.log(2 / ((1 + root) * cos))
+            shadowing = shadowing + log_shadowing(width[k], cos)
         falloff = 2 * xp.log1p(at.tan2_half) - 2 * xp.log1p(at.tan2_half / width[k] ** 2)
         terms.append(xp.exp(fresnel_power * log_fresnel + shadowing_power * shadowing + falloff))
     return xp.stack(terms, axis=-1)
