@@ -250,7 +250,8 @@ def draw(curves, path: str) -> None:
     columns = min(3, len(curves))
     rows = -(-len(curves) // columns)
     size = (4.2 * columns, 3.6 * rows + 0.9)
-    figure, panels = plt.subplots(rows, columns, figsize=size, squeeze=False, sharey=True, layout="constrained")
+    shared = {"squeeze": False, "sharex": True, "sharey": True, "layout": "constrained"}
+    figure, panels = plt.subplots(rows, columns, figsize=size, **shared)
     lines = {}
     for axes, (name, methods) in zip(panels.ravel(), curves.items(), strict=False):
         for method, (label, color, style) in DRAWN.items():
@@ -263,6 +264,7 @@ def draw(curves, path: str) -> None:
         axes.grid(True, which="major", alpha=0.3)
     for axes in panels.ravel()[len(curves) :]:
         axes.set_axis_off()
+    panels[0, 0].xaxis.set_minor_formatter("")
     for axes in panels[:, 0]:
         axes.set_ylabel("eta of eq. (18) at the worst incident angle [%]")
     layout = {"loc": "outside lower center", "ncols": 4 if columns > 1 else 2, "fontsize": 8, "frameon": False}
