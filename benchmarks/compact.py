@@ -1,10 +1,11 @@
-"""Error against size of the compact forms beside plain ones: python -m benchmarks.compact [--plot PNG] [FILE ...].
+"""Error against bytes of the compact forms beside plain ones: python -m benchmarks.compact [--plot PNG] [NAME ...].
 
 Eta of eq. (18) in percent, median and worst over the incident angles with data, of the guided
-field of each measurement (a name like amber_glass is an embedded sample; true:NAME is its truth
-on the paper's grid). Without names: the embedded samples, their truths, and the Cornell files
-of ../shared. Numbers are stored ones for each incident angle of 13, everything counted; a
-number takes 8 bytes.
+field of each measurement: a file, or a name like amber_glass for an embedded sample; true:NAME is
+its truth on the paper's grid. Without names: amber_glass, and the Cornell files garnet_red and
+cayman of ../shared where they are. Numbers are stored ones for each incident angle of 13, everything
+counted. Bytes are those of the whole field: of a form as its storage lies on disk, of plain ones 8 a
+number and 4 an index.
 """
 
 import argparse
@@ -20,8 +21,21 @@ from benchmarks.records import Record, record_of, timed
 from benchmarks.solver import CORNELL
 
 GLASSES = ("amber_glass", "amber_glass_sharp", "amber_glass_broad")
+DEFAULT = ("amber_glass", "garnet_red", "cayman")
 SIZES = (64, 107, 214, 513)
-ERRORS = (0.045, 0.01)
+FORMS = {"lobe_tensor": (SIZES, (0.045, 0.01)), "lobe_harmonics": (SIZES[1:], (0.045,))}  # numbers, then errors
+STORED = ("float64", "float16", "quantised")
+DRAWN = {  # in the picture: label, colour, line
+    "lobe_tensor, quantised": ("lobe_tensor, quantised", "C0", "-"),
+    "lobe_tensor, float64": ("lobe_tensor, float64", "C0", "--"),
+    "lobe_harmonics, quantised": ("lobe_harmonics, quantised", "C1", "-"),
+    "lobe_harmonics, float64": ("lobe_harmonics, float64", "C1", "--"),
+    "tucker": ("Tucker without lobe", "C2", "-"),
+    "svd": ("truncated SVD", "C3", "-"),
+    "harmonics": ("harmonics alone", "C4", "-"),
+    "dct": ("4-D DCT, with indices", "C5", "-"),
+    "paper, float64": ("paper", "k", ""),
+}
 FEWEST = 20  # directions of an embedded sample, for its wavelengths alone
 
 
@@ -35,7 +49,8 @@ def main(arguments: list[str] | None = None) -> None:
     from sbrdf_jax.runtime import set_up_jax
 
     set_up_jax()
-    names = args.names or [f"true:{n}" for n in GLASSES] + list(GLASSES) + sorted(map(str, CORNELL.glob("*.brdf")))
+    files = {path.stem: str(path) for path in CORNELL.glob("*.brdf")}
+    names = args.names or [files.get(name, name) for name in DEFAULT if name in files or name.startswith("amber")]
     curves = {Path(name).stem: measure(name, with_paper=args.paper) for name in names}
     if args.plot:
         draw(curves, args.plot)
@@ -115,14 +130,18 @@ def records(
 
 
 def measure(name: str, *, with_paper: bool) -> dict[str, list[tuple[float, float, float]]]:
-    """Print the table of one material and return (numbers, median, worst) of each method."""
+    """Print the table of one material and return (bytes, median, worst) of each method and storage."""
     from sbrdf_jax.colour import colour_matching
+    from sbrdf_jax.compact_layout import stored_bytes
     from sbrdf_jax.encoding import data_basis, encode_field, make_basis
     from sbrdf_jax.grid import has_data
-    from sbrdf_jax.metrics import error_at_nodes, error_between, off_node_scores, stored_numbers
+    from sbrdf_jax.metrics import error_at_nodes, error_between, stored_numbers
     from sbrdf_jax.options import RepresentOptions, TargetOptions
     from sbrdf_jax.representation import represent
+    from sbrdf_jax.representation.storage_choice import store
+    from sbrdf_jax.representation.target import make_target
 
+    start = time.perf_counter()
     gridded = gridded_field(name)
     wavelength_nm, brdf = np.asarray(gridded.wavelength_nm), np.asarray(gridded.brdf)
     known = has_data(gridded)
@@ -131,44 +150,49 @@ def measure(name: str, *, with_paper: bool) -> dict[str, list[tuple[float, float
     per_angle = len(known)
     curves: dict[str, list[tuple[float, float, float]]] = {}
 
-    def report(method, numbers, eta, more=""):
-        at = numbers / per_angle, 100 * np.median(eta[known]), 100 * eta[known].max()
-        curves.setdefault(method, []).append(at)
-        print(f"{method:<20} {at[0]:>8.1f} {8 * at[0]:>8.0f} {at[1]:>9.3f} {at[2]:>9.3f} {more}", flush=True)
+    def report(method, numbers, size, eta, more=""):
+        found = size, 100 * np.median(eta[known]), 100 * eta[known].max()
+        curves.setdefault(method, []).append(found)
+        print(
+            f"{method:<26} {numbers / per_angle:>8.1f} {size:>8} {found[1]:>9.3f} {found[2]:>9.3f} {more}", flush=True
+        )
 
-    print(f"\n{Path(name).name}: {known.sum()} of {per_angle} incident angles have data")
-    print(f"{'method':<20} {'numbers':>8} {'bytes':>8} {'median %':>9} {'worst %':>9}")
-    targets = [TargetOptions(numbers=size) for size in SIZES] + [TargetOptions(error=error) for error in ERRORS]
-    harmonics = [TargetOptions(numbers=size) for size in (*SIZES[1:-1], 320, SIZES[-1])] + targets[-len(ERRORS) :]
-    for method, target in [("lobe_tensor", t) for t in targets] + [("lobe_harmonics", t) for t in harmonics]:
-        options = RepresentOptions(method=method, target=target)
-        represent(field, options, gridded)
-        start = time.perf_counter()
-        compact = represent(field, options, gridded)
-        seconds = time.perf_counter() - start
-        at_nodes = error_at_nodes(compact, gridded, matching)
-        between = error_between(compact, gridded)
-        if name.startswith("true:"):
-            between = error_between_truth(compact, gridded, name.removeprefix("true:"))
-        off = [100 * np.nanmedian(value[mask]) for value, mask in (
-            (between["relative_error_between"], known),
-            (between["relative_error_between_theta_i"], known[:-1] & known[1:]),
-        )]  # fmt: skip
-        asked = f"{100 * target.error:g} % everywhere; " if target.error else ""
-        colour = np.median(at_nodes["delta_e_median"][known])
-        share = off_node_scores(compact)[0]
-        more = f"{asked}between {off[0]:.2f}, between theta_i {off[1]:.2f}, Delta E {colour:.2f}, < 0: {share:g}"
-        report(method, stored_numbers(compact), at_nodes["relative_error"], f"{more}, {seconds:.2f} s warm")
+    def report_stored(method, compact, part, promises=(), asked=""):
+        for storage in STORED:
+            form = compact if storage == "float64" else store(compact, storage, part, gridded, promises, None).compact
+            at_nodes, more = error_at_nodes(form, gridded, matching), asked
+            if storage == "float64":
+                truth = name.removeprefix("true:") if name.startswith("true:") else None
+                between = error_between(form, gridded) if truth is None else error_between_truth(form, gridded, truth)
+                off = [100 * np.nanmedian(value[mask]) for value, mask in (
+                    (between["relative_error_between"], known),
+                    (between["relative_error_between_theta_i"], known[:-1] & known[1:]),
+                )]  # fmt: skip
+                colour = np.median(at_nodes["delta_e_median"][known])
+                more += f"between {off[0]:.2f}, between theta_i {off[1]:.2f}, Delta E {colour:.2f}"
+            label = f"{method}, {storage}" if form.storage == storage else f"{method}, {storage} ({form.storage})"
+            report(label, stored_numbers(form), stored_bytes(form), at_nodes["relative_error"], more)
+
+    print(f"\n{Path(name).name}: {known.sum()} of {per_angle} incident angles have data, {brdf.nbytes} bytes of grid")
+    print(f"{'method':<26} {'numbers':>8} {'bytes':>8} {'median %':>9} {'worst %':>9}")
+    for method, (sizes, errors) in FORMS.items():
+        for target in [TargetOptions(numbers=size) for size in sizes] + [TargetOptions(error=e) for e in errors]:
+            options = RepresentOptions(method=method, target=target)
+            promises = make_target(target, per_angle, len(wavelength_nm)).stops
+            asked = f"{100 * target.error:g} % everywhere; " if target.error else ""
+            report_stored(method, represent(field, options, gridded), field, promises, asked)
     for method, baseline in BASELINES.items():
         for size in SIZES:
             numbers, found = baseline(brdf, known, size * per_angle)
             if found is not None:
                 error = ((found - brdf) ** 2).sum(axis=(1, 2, 3)) / (brdf**2).sum(axis=(1, 2, 3))
-                report(method, numbers, np.sqrt(error))
+                indices = (numbers - known.sum()) // 2 if method == "dct" else 0
+                report(method, numbers, 8 * (numbers - indices) + 4 * indices, np.sqrt(error))
     if with_paper:
-        compact = represent(encode_field(gridded, make_basis(wavelength_nm, "fourier", 19)), RepresentOptions("paper"))
-        report("paper", stored_numbers(compact), error_at_nodes(compact, gridded, matching)["relative_error"])
+        series = encode_field(gridded, make_basis(wavelength_nm, "fourier", 19))
+        report_stored("paper", represent(series, RepresentOptions("paper")), series)
     leave_out(gridded, field, known)
+    print(f"{time.perf_counter() - start:.0f} s", flush=True)
     return curves
 
 
@@ -220,25 +244,33 @@ def leave_out(gridded, field, known) -> None:
 
 
 def draw(curves, path: str) -> None:
-    """Draw error against bytes, a panel for each material: the worst incident angle solid, the median dotted."""
+    """Draw the worst incident angle's error against bytes, a panel for each material, one legend below all."""
     import matplotlib.pyplot as plt
 
     columns = min(3, len(curves))
     rows = -(-len(curves) // columns)
-    figure, panels = plt.subplots(rows, columns, figsize=(4 * columns, 3.2 * rows), squeeze=False, sharey=True)
+    size = (4.2 * columns, 3.6 * rows + 0.9)
+    shared = {"squeeze": False, "sharex": True, "sharey": True, "layout": "constrained"}
+    figure, panels = plt.subplots(rows, columns, figsize=size, **shared)
+    lines = {}
     for axes, (name, methods) in zip(panels.ravel(), curves.items(), strict=False):
-        for number, (method, points) in enumerate(methods.items()):
-            color = f"C{number}"
-            numbers, median, worst = np.array(sorted(points)).T
-            axes.loglog(8 * numbers, worst, color=color, marker="o", markersize=3, label=method)
-            axes.loglog(8 * numbers, median, color=color, linestyle=":")
+        for method, (label, color, style) in DRAWN.items():
+            if method in methods:
+                stored, _, worst = np.array(sorted(methods[method])).T
+                marker = "*" if method.startswith("paper") else "o"
+                (lines[label],) = axes.loglog(stored, worst, color=color, linestyle=style, marker=marker, markersize=4)
         axes.set_title(name)
-        axes.set_xlabel("bytes for each incident angle")
+        axes.set_xlabel("stored bytes of the whole field")
+        axes.grid(True, which="major", alpha=0.3)
+    for axes in panels.ravel()[len(curves) :]:
+        axes.set_axis_off()
+    panels[0, 0].xaxis.set_minor_formatter("")
     for axes in panels[:, 0]:
-        axes.set_ylabel("relative error [%]")
-    panels[0, 0].legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
+        axes.set_ylabel("eta of eq. (18) at the worst incident angle [%]")
+    layout = {"loc": "outside lower center", "ncols": 4 if columns > 1 else 2, "fontsize": 8, "frameon": False}
+    figure.legend(list(lines.values()), list(lines), **layout)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
 
 
 if __name__ == "__main__":

@@ -48,8 +48,12 @@ def tucker(brdf, known, budget):
     def count(ranks):
         return int(np.prod(ranks)) + sum(r * n for r, n in zip(ranks, half.shape, strict=True)) + len(scale)
 
+    held = core**2  # of ranks up to an entry's place, once it is summed over all modes
+    for mode in range(4):
+        held = held.cumsum(axis=mode)
+
     def energy(ranks):
-        return (core[tuple(slice(r) for r in ranks)] ** 2).sum()
+        return held[tuple(rank - 1 for rank in ranks)]
 
     ranks = [1, 1, 1, 1]
     while True:

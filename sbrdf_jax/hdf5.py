@@ -15,6 +15,7 @@ from sbrdf_jax.errors import UserError
 CHUNKED_FROM = 2  # dimensions
 GROWTH = 2**22  # bytes; a file in memory grows by so much
 LARGEST_COMPACT = 2**15  # bytes; datasets up to it lie in their own header, whose checksum covers them
+LONGEST_PLAIN = 64  # bytes; what is shorter gains nothing by compression
 FORMAT = ("v110", "v110")  # of HDF5: the oldest whose every header has a checksum, so that damage is told, not followed
 LONGEST_REASON = 200  # characters of an error that quotes a file
 MOST_EXPANSION = 1000  # a dataset may declare at most this many times what it holds, or the file is refused
@@ -53,17 +54,22 @@ def dataset(
     axes: list[h5py.Dataset],
     *,
     chunks: tuple[int, ...] | None = None,
+    narrow: bool = False,
 ) -> h5py.Dataset:
     """Write one dataset with units and a dimension scale on each axis.
 
     Where it has more than one axis, its chunks have the shape `chunks`, or unless given that of an entry of the first
-    axis. A checksum covers every one, whatever its size: a flipped bit is an error, never another number.
+    axis. A checksum covers every one, whatever its size: a flipped bit is an error, never another number. Floats are
+    written in float64; or, if `narrow`, as they are given, and whatever is not very short is compressed.
     """
     value = np.asarray(value)
-    if value.dtype.kind == "f":
+    if value.dtype.kind == "f" and not narrow:
         value = value.astype(np.float64)
     options: dict[str, Any] = {"track_times": False}  # equal input, equal bytes
-    if value.ndim >= CHUNKED_FROM and value.size:
+    if narrow and value.nbytes > LONGEST_PLAIN:
+        options |= {"chunks": value.shape, "shuffle": True, "compression": "gzip", "compression_opts": 9}
+        options |= {"fletcher32": True}
+    elif value.ndim >= CHUNKED_FROM and value.size:
         options |= {"chunks": chunks or (1, *value.shape[1:]), "fletcher32": True}
     elif value.nbytes <= LARGEST_COMPACT:
         options["dcpl"] = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
@@ -78,9 +84,9 @@ def dataset(
     return written
 
 
-def scale(group: h5py.Group, name: str, value, units: str) -> h5py.Dataset:
-    """Write an axis as a dimension scale."""
-    written = dataset(group, name, value, units, [])
+def scale(group: h5py.Group, name: str, value, units: str, *, narrow: bool = False) -> h5py.Dataset:
+    """Write an axis as a dimension scale; `narrow` as for `dataset`."""
+    written = dataset(group, name, value, units, [], narrow=narrow)
     written.make_scale(name)
     return written
 

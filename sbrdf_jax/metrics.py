@@ -36,7 +36,7 @@ METRIC_AXES = {
     "albedo_compact": ("theta_i", "wavelength"),
     "relative_error_between_theta_i": ("theta_i_between",),
 }
-METRIC_UNITS = {"negative_depth": "1/sr", "negative_depth_grid": "1/sr"}
+METRIC_UNITS = {"negative_depth": "1/sr", "negative_depth_grid": "1/sr", "stored_bytes": "byte"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +85,7 @@ def measure(
         needed, whole = needed_nodes(gridded)[rows], whole_hemispheres(gridded)[rows]
         if field is not None:
             split = error_split(compact, *restrict_theta_i(field, gridded, np.asarray(compact.theta_i)))
-            value |= {name: _on_rows(part, rows) for name, part in split.items()}
+            value |= {name: on_rows(part, rows) for name, part in split.items()}
         share, depth, reciprocity = off_node_scores(compact, seed=seed, needed=needed)
         value |= {"negative_share": share, "negative_depth": depth, "reciprocity_error_compact": reciprocity}
         of_compact = albedo(compact, whole)
@@ -96,7 +96,7 @@ def measure(
     return Metrics({name: np.asarray(v) for name, v in value.items()}, tuple(warnings))
 
 
-def _on_rows(part: np.ndarray, rows: Bool[np.ndarray, " theta_i"]) -> np.ndarray:
+def on_rows(part: np.ndarray, rows: Bool[np.ndarray, " theta_i"]) -> np.ndarray:
     """Put values of some incident angles among all, nan at the others."""
     every = np.full(len(rows), np.nan)
     every[rows] = part

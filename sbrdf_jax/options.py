@@ -123,6 +123,9 @@ class RepresentOptions:
     """Highest degree L of the harmonics; auto: 4, used as it is, for paper; a limit, 8, otherwise."""
     lobe: Literal["angle_squared", "tan_squared", "tan", "best"] = "best"
     """Kind of the lobe for paper, equations 14 to 16; best: the kind with the smallest error."""
+    storage: Literal["float64", "float32", "float16", "quantised"] = "float64"
+    """How the numbers are stored; what rounding them adds is measured. quantised: as few bits as add a tenth of the
+    form's own error at most; wider than asked for, with a warning, where a promised error would not be kept."""
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,11 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from sbrdf_jax.cleaning import CleanResult, clean
+from sbrdf_jax.compact_layout import stored_bytes
 from sbrdf_jax.encoding import coefficients_allowed, data_basis, encode_field, make_basis
 from sbrdf_jax.folds import LEAVE_ONE_OUT, Folds, make_folds
 from sbrdf_jax.grid import Grid, has_data, make_grid
-from sbrdf_jax.metrics import live_wavelengths, measure, needed_nodes
+from sbrdf_jax.metrics import live_wavelengths, measure, needed_nodes, on_rows
 from sbrdf_jax.needs import Needs, restrict_theta_i
 from sbrdf_jax.options import EncodeOptions, RunOptions
 from sbrdf_jax.plan import PlanRow, describe_needs, plan_run, plan_validation, predict_cost
@@ -128,11 +129,12 @@ def process(
         part, live = restrict_theta_i(field, live, ready.grid.theta_i[needs.theta_i])
         budget = None if options.scene is None else options.scene.error_budget
         compact, searched = represent_with_plan(part, options.represent, live, matching, budget)
-        missed = tuple(searched.pop("warnings", ()))
+        missed, rounding = tuple(searched.pop("warnings", ())), searched.pop("storage_error")
         progress.update(count_statuses(compact.status))
 
     with _timed(progress, timing, "measure"):
         metrics = measure(gridded, field, compact, absolute=raw.quantity == "brdf", matching=matching)
+        metrics.value.update(storage_scores(compact, rounding, gridded))
 
     validation = {}
     if ready.folds:
@@ -166,6 +168,12 @@ def process(
         source_sha256=raw.source_sha256,
         quadrature=ready.quadrature,
     )
+
+
+def storage_scores(compact, rounding: np.ndarray, gridded: GriddedBRDF) -> dict[str, np.ndarray]:
+    """Return how many bytes a compact form takes, and what rounding it added at the incident angles of the grid."""
+    rows = np.isin(np.asarray(gridded.theta_i), np.asarray(compact.theta_i))
+    return {"stored_bytes": np.asarray(stored_bytes(compact)), "storage_error": on_rows(rounding, rows)}
 
 
 def spectral_basis(gridded: GriddedBRDF, options: EncodeOptions) -> SpectralBasis:

@@ -17,13 +17,17 @@ from sbrdf_jax.status import Status as Status
 
 
 @typing.dataclass_transform(frozen_default=True)
-def pytree(*, static: tuple[str, ...] = ()):
-    """Class decorator: a frozen dataclass that JAX may trace, but for the fields `static`."""
+def pytree(*, static: tuple[str, ...] = (), host: tuple[str, ...] = ()):
+    """Class decorator: a frozen dataclass that JAX may trace, but for the fields `static`.
+
+    The fields `host` change no value: JAX does not see them, compiles once whatever they are, and returns their
+    defaults.
+    """
 
     def register(cls):
         cls = dataclasses.dataclass(frozen=True)(cls)
-        data = [f.name for f in dataclasses.fields(cls) if f.name not in static]
-        return jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=list(static))
+        data = [f.name for f in dataclasses.fields(cls) if f.name not in static + host]
+        return jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=list(static), drop_fields=host)
 
     return register
 
@@ -124,7 +128,7 @@ class SpectralField:
     interpolate_theta_i: bool = True
 
 
-@pytree(static=("max_degree", "interpolate_theta_i"))
+@pytree(static=("max_degree", "interpolate_theta_i"), host=("storage",))
 class CompactBRDF:
     """Eq. (13) for every incident angle and coefficient: harmonics plus one lobe.
 
@@ -143,9 +147,10 @@ class CompactBRDF:
     status: Any  # [theta_i, coefficient] Status
     max_degree: int = 4
     interpolate_theta_i: bool = True
+    storage: str = "float64"  # how its numbers are written; they are rounded to it already
 
 
-@pytree(static=("half_angle_floor", "interpolate_theta_i"))
+@pytree(static=("half_angle_floor", "interpolate_theta_i"), host=("storage",))
 class LobeTensor:
     """A Tucker decomposition over theta_i, theta_o, a directional factor with all lobes, and the spectrum.
 
@@ -165,9 +170,10 @@ class LobeTensor:
     status: Any  # [theta_i] Status; SKIPPED where an incident angle has no data
     half_angle_floor: float = 1e-4
     interpolate_theta_i: bool = True
+    storage: str = "float64"  # how its numbers are written; they are rounded to it already
 
 
-@pytree(static=("max_degree", "interpolate_theta_i"))
+@pytree(static=("max_degree", "interpolate_theta_i"), host=("storage",))
 class LobeHarmonics:
     """Even spherical harmonics plus up to two lobes at every incident angle that has data.
 
@@ -189,3 +195,4 @@ class LobeHarmonics:
     status: Any  # [theta_i] Status; SKIPPED where an incident angle has no data
     max_degree: int = 8
     interpolate_theta_i: bool = True
+    storage: str = "float64"  # how its numbers are written; they are rounded to it already

@@ -126,6 +126,8 @@ def done_table(result: RunResult) -> Table:
     ratios = [(name, text) for name, text in RATIOS if name in result.metrics]
     if ratios:
         rows.append(("size", ", ".join(f"{float(result.metrics[name]):.4g}:1 {text}" for name, text in ratios)))
+    if result.compact is not None and "stored_bytes" in result.metrics:
+        rows.append(("", storage_text(result)))
     for stage, suffix in (("grid", "_grid"), ("compact", "")):
         if f"negative_share{suffix}" in result.metrics:
             share, depth = (float(result.metrics[f"negative_{what}{suffix}"]) for what in ("share", "depth"))
@@ -157,6 +159,14 @@ RATIOS = (
     ("compression_ratio", "with every stored number"),
     ("compression_ratio_paper", "as the paper counts (mirror images and pole copies of the data counted)"),
 )
+
+
+def storage_text(result: RunResult) -> str:
+    """How many bytes the compact form takes, and what its storage adds to its error."""
+    assert result.compact is not None
+    worst = np.nanmax(np.asarray(result.metrics["storage_error"]), initial=0.0)
+    rounding = f", whose rounding adds at most {_number(100 * float(worst))} %" if worst > 0 else ""
+    return f"{int(result.metrics['stored_bytes'])} bytes as {result.compact.storage}{rounding}"
 
 
 def coverage_text(extrapolated) -> str:

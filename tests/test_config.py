@@ -58,6 +58,8 @@ WRONG_KEYS_AND_VALUES = [
     ("resample: {method: {a: 1}}", "2:20: resample.method: found a block", "one of paper, guided"),
     ("resample: {window: fakctor}", "2:20: resample.window: found 'fakctor'", "did you mean 'factor'?"),
     ("represent: {lobe: Best}", "2:19: represent.lobe: found 'Best'", "did you mean 'best'?"),
+    ("represent: {storage: float31}", "2:22: represent.storage: found 'float31'", "did you mean 'float32'?"),
+    ("represent: {storage: 8}", "2:22: represent.storage: found 8", "one of float64, float32, float16, quantised"),
     ("grid: {theta_o_step_deg: 91}", "2:26: grid.theta_o_step_deg: found 91", "at most 45 [deg]"),
     ("grid: {theta_o_step_deg: 0}", "2:26: grid.theta_o_step_deg: found 0", "of at least 0.1"),
     ("resample: {tolerance: 1.0}", "2:23: resample.tolerance: found 1.0", "above 0 and below 1"),

@@ -14,6 +14,7 @@ from sbrdf_jax.config import parse_config, resolve
 from sbrdf_jax.formats import read, write_samples
 from sbrdf_jax.grid import make_grid
 from sbrdf_jax.masks import write_footprint
+from sbrdf_jax.metrics import measure
 from sbrdf_jax.needs import everything
 from sbrdf_jax.options import GridOptions, ResampleOptions
 from sbrdf_jax.pipeline import prepare
@@ -78,6 +79,24 @@ def test_another_target_recomputes_the_representation_only(folder, solved):
     np.testing.assert_array_equal(found.gridded.brdf, some.gridded.brdf)
     np.testing.assert_array_equal(found.gridded.standard_error, some.gridded.standard_error)
     assert found.metrics["compression_ratio"] != some.metrics["compression_ratio"]
+
+
+def test_another_storage_recomputes_the_representation_only(folder, solved, capsys):
+    wide = load(folder / "some.h5")
+    scene = scene_of(wide.gridded.wavelength_nm)
+    assert main(command(folder, "narrow.h5", scene, "represent.storage=quantised", earlier="some.h5")) == 0
+    assert solved == {"solved": [], "estimated": []}
+    found = load(folder / "narrow.h5")
+    np.testing.assert_array_equal(found.gridded.brdf, wide.gridded.brdf)
+    assert (wide.compact.storage, found.compact.storage) == ("float64", "quantised")
+    assert found.metrics["stored_bytes"] < 0.6 * wide.metrics["stored_bytes"]
+    assert (wide.metrics["storage_error"] == 0).all() and np.nanmax(found.metrics["storage_error"]) > 0
+    assert "bytes as quantised, whose rounding adds at most" in capsys.readouterr().err
+    # what is stored of the form is what is read back, not the numbers before rounding
+    again = measure(found.gridded, found.field, found.compact)
+    for name in ("relative_error", "relative_error_between", "delta_e_median"):
+        np.testing.assert_allclose(again.value[name], found.metrics[name], rtol=1e-6, atol=1e-12)
+    assert (found.metrics["relative_error"] != wide.metrics["relative_error"]).any()
 
 
 def test_more_wavelengths_compute_what_is_new(folder, solved):

@@ -2,10 +2,13 @@
 
 from typing import Any
 
+import numpy as np
+
 from sbrdf_jax.colour import ColourMatching
 from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.options import ErrorBudget, RepresentOptions
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, SpectralField
+from sbrdf_jax.representation.target import Target, in_words, make_target
 from sbrdf_jax.runtime import require_float64
 
 
@@ -16,7 +19,7 @@ def represent(
 
     Args:
         field: Coefficients at the nodes.
-        options: Method, target and limits.
+        options: Method, target, limits and storage.
         gridded: The grid stage, where there is one: other methods than "paper" are then measured
             against its spectra and fitted between its nodes too.
 
@@ -33,13 +36,34 @@ def represent_with_plan(
     matching: ColourMatching | None = None,
     budget: ErrorBudget | None = None,
 ) -> tuple[CompactBRDF | LobeHarmonics | LobeTensor, dict[str, Any]]:
-    """Return what `represent` does, and what was computed and what was skipped, and why."""
+    """Return what `represent` does, and what was computed and what was skipped, and why.
+
+    What was found has `storage_error` [theta_i]: eta of eq. (18) between the form as stored and unrounded.
+    """
     # here, because evaluation, which these methods use, imports the values of this package's records
     from sbrdf_jax.representation import lobe_harmonics, lobe_tensor, paper
 
     require_float64()
     if options.method == "paper":
-        return paper.represent(field, options)
+        compact, plan = paper.represent(field, options)
+        return _stored(compact, plan, field, options, gridded, matching, None)
     method = lobe_harmonics if options.method == "lobe_harmonics" else lobe_tensor
     with one_blas_thread():
-        return method.represent(field, options, gridded, matching, budget)
+        compact, plan = method.represent(field, options, gridded, matching, budget)
+    num_theta_i, num_wavelengths = np.size(field.theta_i), np.size(field.basis.wavelength_nm)
+    target = make_target(options.target, num_theta_i, num_wavelengths, budget)
+    return _stored(compact, plan, field, options, gridded, matching, target)
+
+
+def _stored(compact, plan, field, options, gridded, matching, target: Target | None):
+    """Round a compact form to the storage that the options name, and say in its plan what that did."""
+    if options.storage == "float64":
+        return compact, plan | {"storage": "float64", "storage_error": np.zeros(np.size(compact.theta_i))}
+    from sbrdf_jax.representation.storage_choice import store
+
+    stored = store(compact, options.storage, field, gridded, () if target is None else target.stops, matching)
+    plan = plan | {"storage": stored.compact.storage, "storage_error": stored.error}
+    plan["warnings"] = [*plan.get("warnings", ()), *stored.warnings]
+    if target is not None and target.kind in stored.achieved:
+        plan["measured"] = in_words(target, stored.achieved[target.kind])
+    return stored.compact, plan

@@ -20,7 +20,7 @@ from sbrdf_jax.representation.direction_functions import (
     num_direction_functions,
 )
 from sbrdf_jax.representation.half_field import Block, HalfField, half_field
-from sbrdf_jax.representation.target import Target, is_met, make_target, measured, node_errors
+from sbrdf_jax.representation.target import Target, in_words, is_met, make_target, measured, node_errors
 from sbrdf_jax.representation.tensor_fit import Factors, Normal, TensorFit
 from sbrdf_jax.representation.tensor_growth import grow
 from sbrdf_jax.splines import spline_weights
@@ -241,22 +241,13 @@ def make_plan(target: Target, achieved: float, half: HalfField) -> dict[str, Any
     met = is_met(target, achieved)
     warnings = []
     if not met:
-        warnings.append(f"compact: the target, {target.text}, is not met: {_in_words(target, achieved)} is the best")
+        warnings.append(f"compact: the target, {target.text}, is not met: {in_words(target, achieved)} is the best")
     if half.asymmetry > ASYMMETRIC:
         share = f"{100 * half.asymmetry:.2g} %"
         warnings.append(f"compact: {share} of the field is not symmetric to the plane of incidence and was dropped")
     return {
         "promised": target.text,
-        "measured": _in_words(target, achieved),
+        "measured": in_words(target, achieved),
         "is_met": int(met),
         "warnings": warnings,
     }
-
-
-def _in_words(target: Target, value: float) -> str:
-    return {
-        "ratio": f"{value:.4g}:1",
-        "numbers": f"{value:.4g} numbers for each incident angle",
-        "error": f"{100 * value:.3g} % at the worst",
-        "delta_e": f"{value:.3g} at the worst",
-    }[target.kind]

@@ -113,3 +113,13 @@ def measured(
 def is_met(target: Target, value: float) -> bool:
     """True where a measured value keeps the promise."""
     return value >= target.value if target.kind == "ratio" else value <= target.value
+
+
+def in_words(target: Target, value: float) -> str:
+    """Say what was measured, in the words of the promise."""
+    return {
+        "ratio": f"{value:.4g}:1",
+        "numbers": f"{value:.4g} numbers for each incident angle",
+        "error": f"{100 * value:.3g} % at the worst",
+        "delta_e": f"{value:.3g} at the worst",
+    }[target.kind]
