@@ -107,11 +107,14 @@ def peak_bytes() -> int:
 
 
 def machine() -> dict[str, Any]:
-    """What the records of one run share: versions, processor, threads, commit."""
+    """What the records of one run share: versions, processor, device, threads, commit."""
+    import jax
+
     return {
         "python": platform.python_version(),
         "versions": {name: found for name in PACKAGES if (found := version_of(name))},
         "cpu": _cpu(),
+        "device": jax.devices()[0].device_kind,  # of JAX; "cpu" where there is no accelerator
         "threads": int(os.environ.get("NPROC", len(os.sched_getaffinity(0)))),
         "load": round(os.getloadavg()[0], 2),
         "commit": _commit(),
@@ -132,11 +135,16 @@ def as_line(record: Record, shared: Mapping[str, Any]) -> str:
     return json.dumps(dataclasses.asdict(record) | dict(shared), sort_keys=True)
 
 
-def read_lines(path: str | Path) -> list[Record]:
-    """Read the records of a file of JSON lines."""
+def read_runs(path: str | Path) -> list[tuple[Record, dict[str, Any]]]:
+    """Read the records of a file of JSON lines, each with what its run shares."""
     names = [field.name for field in dataclasses.fields(Record)]
     lines = [json.loads(line) for line in Path(path).read_text().splitlines()]
-    return [Record(**{name: line[name] for name in names}) for line in lines]
+    return [(Record(**{name: line.pop(name) for name in names}), line) for line in lines]
+
+
+def read_lines(path: str | Path) -> list[Record]:
+    """Read the records of a file of JSON lines."""
+    return [record for record, _ in read_runs(path)]
 
 
 def _cpu() -> str:

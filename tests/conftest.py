@@ -23,6 +23,11 @@ SHARED = ROOT.parent / "shared"  # measured data that are not part of the reposi
 IN_CI = os.environ.get("CI", "").lower() in ("1", "true")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Let the nightly script ask for more damaged files than the usual run reads."""
+    parser.addoption("--fuzz-inputs", type=int, metavar="N", help="damaged files for each reader; unset: a few hundred")
+
+
 def shared_file(name: str) -> Path:
     """Path of a measured file below `SHARED`; skips the test by name where it is absent, fails in CI."""
     path = SHARED / name

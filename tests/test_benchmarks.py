@@ -57,7 +57,7 @@ def test_lines_of_json_read_back_and_say_where_they_come_from(tmp_path):
 def test_tables_and_plots_are_made_of_records(tmp_path, capsys):
     records = [a_record(samples=count, seconds=(9.0, count**1.5)) for count in (100, 200, 400)]
     print_tables(records)
-    assert "exponent of the warm time over samples 1.50" in capsys.readouterr().out
+    assert "over samples, exponent of the warm time 1.50, of the peak memory 0.00" in capsys.readouterr().out
     assert list(exponents(records[:2])) == []
     (picture,) = draw(records, tmp_path / "pictures")
     assert picture.name == "resampling.png" and picture.stat().st_size > 1000

@@ -16,7 +16,6 @@ from test_formats import CSV, NIST, PBRT, write_raw
 from sbrdf_jax import store
 from sbrdf_jax.cleaning import clean
 
-MANY = 100_000
 DEFAULT = {"pbrt": 2000, "csv": 2000, "nist": 2000, "config": 300, "directions": 2000, "folds": 2000}
 DEFAULT |= {"raw_hdf5": 300, "result": 300}  # a child process reads these, or an HDF5 file is opened three times
 CONFIG = """input: {path: a.csv, format: csv, scale: 2.0}  # a comment
@@ -74,11 +73,5 @@ def fuzz(kind: str, count: int, seeds, folder) -> list[str]:
 
 
 @pytest.mark.parametrize("kind", DEFAULT)
-def test_a_damaged_file_is_an_answer_or_one_line(kind, seeds, tmp_path):
-    assert fuzz(kind, DEFAULT[kind], seeds, tmp_path) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", DEFAULT)
-def test_many_damaged_files_are_an_answer_or_one_line(kind, seeds, tmp_path):
-    assert fuzz(kind, MANY, seeds, tmp_path) == []
+def test_a_damaged_file_is_an_answer_or_one_line(kind, seeds, tmp_path, request):
+    assert fuzz(kind, request.config.getoption("--fuzz-inputs") or DEFAULT[kind], seeds, tmp_path) == []
