@@ -16,6 +16,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "optimistix", "jaxopt", "optax", "osqp", "scikit-learn")
+MEASURED = (
+    "error",
+    "seconds_min",
+    "seconds_median",
+    "seconds_spread",
+    "set_up_seconds",
+    "compile_seconds",
+    "peak_bytes",
+)
 
 
 class Timing(NamedTuple):
@@ -54,10 +63,12 @@ class Record:
     more: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        """Refuse a record without a time or an error."""
-        if not (math.isfinite(self.error) and math.isfinite(self.seconds_min)):
-            found = f"error {self.error}, seconds {self.seconds_min}"
-            raise ValueError(f"{self.problem}, {self.method}: {found}: both must be finite")
+        """Refuse a record without a time, an error or a memory."""
+        found = {name: getattr(self, name) for name in MEASURED}
+        wrong = [f"{name} {value}" for name, value in found.items() if not (math.isfinite(value) and value >= 0)]
+        if wrong or not self.peak_bytes:
+            what = ", ".join(wrong) or "peak_bytes 0"
+            raise ValueError(f"{self.problem}, {self.method}: found {what}: all must be finite, none below 0")
 
 
 def record_of(timing: Timing, *, set_up_seconds: float = 0.0, **named: Any) -> Record:

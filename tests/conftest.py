@@ -24,8 +24,9 @@ IN_CI = os.environ.get("CI", "").lower() in ("1", "true")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Let the nightly script ask for more damaged files than the usual run reads."""
-    parser.addoption("--fuzz-inputs", type=int, metavar="N", help="damaged files for each reader; unset: a few hundred")
+    """Let the nightly script ask for more damaged files than the usual run reads, and for a record of them."""
+    parser.addoption("--fuzz-inputs", type=int, metavar="N", help="damaged files for each reader; unset: some hundred")
+    parser.addoption("--fuzz-records", metavar="FILE", help="append a line for each reader, for benchmarks.pages")
 
 
 def shared_file(name: str) -> Path:

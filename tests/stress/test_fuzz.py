@@ -1,10 +1,12 @@
 """Every reader against damaged files, in a process of its own: an answer or one line; no crash, no hang, no memory."""
 
+import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -74,4 +76,12 @@ def fuzz(kind: str, count: int, seeds, folder) -> list[str]:
 
 @pytest.mark.parametrize("kind", DEFAULT)
 def test_a_damaged_file_is_an_answer_or_one_line(kind, seeds, tmp_path, request):
-    assert fuzz(kind, request.config.getoption("--fuzz-inputs") or DEFAULT[kind], seeds, tmp_path) == []
+    option = request.config.getoption
+    count, start = option("--fuzz-inputs") or DEFAULT[kind], time.perf_counter()
+    wrong = fuzz(kind, count, seeds, tmp_path)
+    if option("--fuzz-records"):
+        seconds = time.perf_counter() - start
+        record = {"table": "fuzzing", "reader": kind, "inputs": count, "wrong": len(wrong), "seconds": round(seconds)}
+        with open(option("--fuzz-records"), "a") as file:
+            print(json.dumps(record), file=file)
+    assert wrong == []
