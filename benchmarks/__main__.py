@@ -52,7 +52,7 @@ def full() -> Suite:
 
     def interpolations():
         for name in ("amber_glass", *measured):
-            yield from interpolation.records(name, samples=1439, wavelengths=31, folds=interpolation.FOLDS)
+            yield from interpolation.records(name, samples=1439, wavelengths=31, folds=3)
 
     return {
         "resampling": resampling,

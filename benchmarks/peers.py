@@ -6,6 +6,7 @@ from importlib.util import find_spec
 import numpy as np
 
 PEERS = {"optax": "optax", "osqp": "osqp", "sklearn": "scikit-learn"}
+OSQP_SECONDS = 60.0
 KERNEL_POINTS = 400  # that a Gaussian process' kernel is fitted to
 
 
@@ -28,7 +29,10 @@ def optax_solver(triangle: np.ndarray, target: np.ndarray) -> Callable[[int], np
 
 
 def osqp_solver(matrix: np.ndarray, rhs: np.ndarray) -> Callable[[float], np.ndarray] | None:
-    """Return OSQP of 1/2 x'A'A x - x'A'b, lane after lane, as a function of its tolerance; None without OSQP."""
+    """Return OSQP of 1/2 x'A'A x - x'A'b, lane after lane, as a function of its tolerance; None without OSQP.
+
+    A lane ends after `OSQP_SECONDS` wherever it is; its residual says where that was.
+    """
     if find_spec("osqp") is None:
         return None
     import osqp
@@ -44,6 +48,7 @@ def osqp_solver(matrix: np.ndarray, rhs: np.ndarray) -> Callable[[float], np.nda
             problem = osqp.OSQP()
             limits = {"l": np.zeros(size), "u": np.full(size, np.inf)}
             settings = {"eps_abs": tolerance, "eps_rel": tolerance, "max_iter": 20_000, "verbose": False}
+            settings["time_limit"] = OSQP_SECONDS
             problem.setup(P=upper, q=-column, A=identity, **limits, **settings)
             found = problem.solve()
             columns.append(np.where(-found.y > found.x, 0.0, found.x))  # at the bound, where its multiplier says so

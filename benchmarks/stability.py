@@ -85,7 +85,11 @@ def certified(status, residual, tolerance: float) -> Row:
 
     status, residual = np.asarray(status), np.asarray(residual)
     honest = np.array_equal(residual <= tolerance, status == Status.OK)
-    return {"KKT": float(np.nanmax(residual)), "status": counted(status), "honest": honest}
+    return {
+        "KKT": float(np.max(residual[np.isfinite(residual)], initial=0.0)),
+        "status": counted(status),
+        "honest": honest,
+    }
 
 
 def counted(status) -> str:

@@ -69,9 +69,9 @@ def test_a_group_yields_whole_records():
 
 
 def test_the_step_of_the_roofline_has_as_many_operations_as_xla_counts():
-    found = list(roofline.records((15.0,), (1, 6), repeats=1, product_size=64, copy_bytes=2**16))
+    found = list(roofline.records((15.0,), (3,), repeats=1, product_size=64, copy_bytes=2**16))
     steps = [record for record in found if record.method == "solver step"]
-    assert len(steps) == 4 and len(found) == 10
+    assert len(steps) == 2 and len(found) == 8
     for record in steps:
         assert 0.9 < record.more["XLA's operations over counted"] < 1.1
         assert record.more["XLA's bytes over counted"] > 1  # those counted are the least that must move
