@@ -33,7 +33,7 @@ def quick() -> Suite:
         "lobes": lambda: lobe_fits.records(2000, loop_lanes=100),
         "representation": lambda: compact.records(name, step_deg=step_deg, **size),
         "pipeline": lambda: pipeline.records([case]),
-        "roofline": lambda: roofline.records((7.5,), (1, 31), repeats=3),
+        "roofline": lambda: roofline.records((7.5,), (1, 31), ("float64",), repeats=3),
     }
 
 

@@ -8,6 +8,7 @@ results/error_time/benchmark_resampling.png.
 """
 
 import argparse
+import itertools
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -142,8 +143,9 @@ def records(
         kind = f"relative L2 error against the truth, nodes to {HIGHEST_DEG:g} degrees"
     matrix = np.asarray(jax.jit(operator.multiply)(jnp.eye(rhs.shape[0])))
     size = {"samples": samples.num_samples, "unknowns": rhs.shape[0], "wavelengths": lanes}
-    points = [own_points(operator, rhs, known, min(set_up.runs), repeats), jaxopt_points(operator, rhs, steps)]
-    for point in [*points[0], *points[1], *dense_points(matrix, np.asarray(rhs), steps)]:
+    own = own_points(operator, rhs, known, min(set_up.runs), repeats)
+    others = jaxopt_points(operator, rhs, steps), dense_points(matrix, np.asarray(rhs), steps)
+    for point in itertools.chain(own, *others):
         far = np.linalg.norm(point.answer - fine) / np.linalg.norm(fine)
         yield record_of(
             point.timing,

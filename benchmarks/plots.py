@@ -12,6 +12,8 @@ from benchmarks.records import Record
 from benchmarks.tables import USUAL, unique
 
 MARKERS = "os^Dv*Pxph"
+LEAST_SPAN = 12.0  # of a logarithmic axis, highest over lowest
+DPI = 110  # many panels: below 150 kB
 COLUMNS = 3  # panels side by side
 NOT_DRAWN = ("cold start",)  # three numbers
 
@@ -44,11 +46,12 @@ def draw_error_time(records: list[Record], path: Path) -> bool:
         for axes, (height, problem) in zip(panels, cells, strict=True):
             some = [record for record in records if record.problem == problem]
             for method in methods:
-                line = sorted((r.seconds_min, getattr(r, height)) for r in some if r.method == method)
+                line = [(r.seconds_min, getattr(r, height)) for r in some if r.method == method]  # as the setting goes
                 at = zip(*line, strict=True) if line else ((), ())
                 axes.loglog(*at, **_look(methods.index(method)), label=method)
             axes.set(title=problem, xlabel="seconds, warm")
             axes.set_ylabel("relative KKT residual" if height == "kkt_residual" else _wrapped(some[0].error_kind))
+            _few_ticks(axes)
         _save(figure, panels[0], path)
     return True
 
@@ -64,7 +67,7 @@ def draw_sizes(records: list[Record], path: Path) -> bool:
         return False
     methods = [method for method in methods if any(len(lines[method]) > 1 for lines in sweeps.values())]
     with style_context():
-        figure, panels = _panels(2 * len(sweeps), columns=len(sweeps), width=3.0)
+        figure, panels = _panels(2 * len(sweeps), columns=len(sweeps), width=2.8)
         rows = (("seconds_min", 1, "seconds, warm"), ("peak_bytes", 2**30, "peak memory [GiB]"))
         cells = [(row, what) for row in rows for what in sweeps]
         for axes, ((name, unit, label), what) in zip(panels, cells, strict=True):
@@ -134,14 +137,20 @@ def _look(number: int) -> dict[str, Any]:
 
 
 def _few_ticks(axes: Any) -> None:
-    """Plain numbers on an axis of less than a decade would overlap: leave the minor ones unlabelled but for 2 and 5."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    """Let an axis span a decade at least, and label 1, 2 and 5 where it spans little more.
 
-    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        subs = (1.0,) if high / low > 30 else (1.0, 2.0, 5.0)
-        axis.set_major_locator(LogLocator(subs=subs))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(NullFormatter())
+    Less makes much of small differences, and labels at every digit overlap.
+    """
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    limits = (axes.xaxis, axes.get_xlim(), axes.set_xlim), (axes.yaxis, axes.get_ylim(), axes.set_ylim)
+    for axis, (low, high), set_limits in limits:
+        margin = max((LEAST_SPAN * low / high) ** 0.5, 1.0)
+        set_limits(low / margin, high * margin)
+        if margin**2 * high / low < 30:
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axis.set_minor_formatter(NullFormatter())
 
 
 def _wrapped(text: str, width: int = 34) -> str:
@@ -152,8 +161,11 @@ def _wrapped(text: str, width: int = 34) -> str:
 
 def _save(figure: Any, legend_of: Any, path: Path) -> None:
     """Write a figure, with one legend for all panels below them where one panel is named that holds all labels."""
+    from matplotlib import rc_context
+
     from sbrdf_jax.report.style import save_figure
 
     if legend_of is not None:
         figure.legend(*legend_of.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
-    save_figure(figure, path)
+    with rc_context({"savefig.dpi": DPI}):
+        save_figure(figure, path)

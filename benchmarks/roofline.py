@@ -59,6 +59,7 @@ def count_step(operator: Any, lanes: int) -> Work:
 def records(
     steps_deg: tuple[float, ...] = STEPS_DEG,
     lanes: tuple[int, ...] = LANES,
+    precisions: tuple[str, ...] = PRECISIONS,
     repeats: int = 5,
     product_size: int = PRODUCT_SIZE,
     copy_bytes: int = COPY_BYTES,
@@ -69,7 +70,7 @@ def records(
     from sbrdf_jax.resampling.normal import normal_equations
 
     products = {}
-    for precision in PRECISIONS:
+    for precision in precisions:
         products[precision] = product_record(jnp.dtype(precision), product_size, repeats)
         yield products[precision]
         yield copy_record(jnp.dtype(precision), copy_bytes, repeats)
@@ -79,7 +80,7 @@ def records(
         samples, grid = case
         operator, rhs = normal_equations(thinned(samples, 1), grid, 1.0)
         problem = f"amber_glass, {step_deg:g} degrees"
-        for precision in PRECISIONS:
+        for precision in precisions:
             dtype = jnp.dtype(precision)
             copy = copy_record(dtype, operator.block.size * dtype.itemsize, repeats, problem)
             yield copy

@@ -68,7 +68,7 @@ def test_a_group_yields_whole_records():
     assert all(record.peak_bytes > 2**20 and record.error < 0.1 for record in found)
 
 
-def test_the_step_of_the_roofline_has_as_many_operations_as_xla_counts():
+def test_the_step_of_the_roofline_has_as_many_operations_as_xla_counts(tmp_path):
     found = list(roofline.records((15.0,), (3,), repeats=1, product_size=64, copy_bytes=2**16))
     steps = [record for record in found if record.method == "solver step"]
     assert len(steps) == 2 and len(found) == 8
@@ -76,6 +76,7 @@ def test_the_step_of_the_roofline_has_as_many_operations_as_xla_counts():
         assert 0.9 < record.more["XLA's operations over counted"] < 1.1
         assert record.more["XLA's bytes over counted"] > 1  # those counted are the least that must move
     assert all(record.error < {"float64": 1e-13, "float32": 1e-5}[record.precision] for record in found)
+    assert draw(found, tmp_path)["roofline"].stat().st_size > 1000
 
 
 def test_tables_and_plots_are_made_of_records(tmp_path, capsys):
@@ -89,11 +90,14 @@ def test_tables_and_plots_are_made_of_records(tmp_path, capsys):
     assert pictures["resampling"].name == "benchmark_resampling.png" and pictures["resampling"].stat().st_size > 1000
 
 
-def test_a_sweep_holds_the_usual_size():
-    usual = dataclasses.replace(a_record(samples=200, seconds=(9.0, 4.0)), setting=USUAL)
+def test_a_sweep_holds_the_usual_size(tmp_path):
+    usual = dataclasses.replace(a_record(samples=200, seconds=(9.0, 4.0)), setting=USUAL, group="pipeline")
     swept = [a_record(samples=count, seconds=(9.0, count / 50)) for count in (400, 100)]
     (line,) = exponents([usual, *swept])
     assert "exponent of the warm time 1.00" in line
+    assert draw([usual], tmp_path) == {}  # one size is no sweep
+    in_group = [dataclasses.replace(record, group="pipeline") for record in swept]
+    assert draw([usual, *in_group], tmp_path)["pipeline"].stat().st_size > 1000
 
 
 def run_of(device: str, created_utc: str) -> dict[str, Any]:
