@@ -4,8 +4,10 @@ import dataclasses
 import json
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from problems import scattered_samples
 
 from benchmarks import lobe_fits, roofline
 from benchmarks.library import summary
@@ -15,7 +17,10 @@ from benchmarks.plots import draw
 from benchmarks.records import MEASURED, Record, Timing, as_line, machine, read_lines, read_runs, record_of, timed
 from benchmarks.stability import certified
 from benchmarks.tables import USUAL, exponents, print_tables
+from sbrdf_jax.grid import make_grid
+from sbrdf_jax.options import GridOptions
 from sbrdf_jax.records import Status
+from sbrdf_jax.resampling.normal import normal_equations
 
 
 def a_record(*, error=0.1, seconds=(2.0, 1.0, 1.5), samples=100, residual: float | None = None) -> Record:
@@ -68,15 +73,20 @@ def test_a_group_yields_whole_records():
     assert all(record.peak_bytes > 2**20 and record.error < 0.1 for record in found)
 
 
-def test_the_step_of_the_roofline_has_as_many_operations_as_xla_counts(tmp_path):
-    found = list(roofline.records((15.0,), (3,), repeats=1, product_size=64, copy_bytes=2**16))
-    steps = [record for record in found if record.method == "solver step"]
-    assert len(steps) == 2 and len(found) == 8
-    for record in steps:
-        assert 0.9 < record.more["XLA's operations over counted"] < 1.1
-        assert record.more["XLA's bytes over counted"] > 1  # those counted are the least that must move
-    assert all(record.error < {"float64": 1e-13, "float32": 1e-5}[record.precision] for record in found)
-    assert draw(found, tmp_path)["roofline"].stat().st_size > 1000
+def test_the_step_of_the_roofline_has_as_many_operations_as_xla_counts(tmp_path, rng):
+    samples = scattered_samples(rng, [0.0, 30.0, 60.0], 60, 1)
+    options = GridOptions(theta_i_step_deg=15.0, theta_o_step_deg=15.0, phi_o_step_deg=15.0)
+    grid = make_grid(samples, options, bilateral=True)
+    operator, rhs = normal_equations(samples, grid, 1.0)
+    double = jnp.dtype("float64")
+    roofs = roofline.product_record(double, 64, 1), roofline.copy_record(double, 2**16, 1)
+    roof = roofs[0].more["GFLOP/s"], roofs[1].more["GB/s"]
+    step = roofline.step_record(operator, rhs, 3, double, roof, 1, "planted")
+    assert 0.9 < step.more["XLA's operations over counted"] < 1.1
+    assert step.more["XLA's bytes over counted"] > 1  # those counted are the least that must move
+    copy = dataclasses.replace(roofs[1], problem="planted")
+    assert all(record.error < 1e-13 for record in (*roofs, step))
+    assert draw([*roofs, copy, step], tmp_path)["roofline"].stat().st_size > 1000
 
 
 def test_tables_and_plots_are_made_of_records(tmp_path, capsys):
