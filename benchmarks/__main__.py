@@ -1,11 +1,13 @@
 """Run time against error, all in one: python -m benchmarks --suite quick|full [--only GROUP ...] [--output FILE.jsonl].
 
-Each record holds a finite warm time and a finite error; the file has a record a line, with versions, processor,
-threads and commit. quick ends within 3 minutes on two cores and needs the base install only; full takes up to an
-hour and the extra `bench`. `python -m benchmarks.plots FILE.jsonl` draws the records.
+Each record holds a finite warm time and a finite error; the file has a record a line, written as soon as it is
+measured, with versions, processor, device, threads and commit. quick ends within 3 minutes on two cores and needs the
+base install only; full takes up to an hour and the extra `bench`. `python -m benchmarks.pages FILE.jsonl ...` makes the
+pages of the documentation of such files.
 """
 
 import argparse
+import contextlib
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -20,7 +22,7 @@ Suite = dict[str, Callable[[], Iterator[Record]]]
 
 def quick() -> Suite:
     """The groups of the quick suite: small, on the embedded sample."""
-    from benchmarks import compact, error_time, interpolation, lobe_fits, pipeline
+    from benchmarks import compact, error_time, interpolation, lobe_fits, pipeline, roofline
 
     name, step_deg = "amber_glass", 15.0
     case = pipeline.Case("paper", samples=750, step_deg=step_deg, wavelengths=8)
@@ -31,12 +33,13 @@ def quick() -> Suite:
         "lobes": lambda: lobe_fits.records(2000, loop_lanes=100),
         "representation": lambda: compact.records(name, step_deg=step_deg, **size),
         "pipeline": lambda: pipeline.records([case]),
+        "roofline": lambda: roofline.records((7.5,), (1, 31), ("float64",), repeats=3),
     }
 
 
 def full() -> Suite:
     """The groups of the full suite."""
-    from benchmarks import compact, error_time, interpolation, lobe_fits, pipeline
+    from benchmarks import compact, error_time, interpolation, lobe_fits, pipeline, roofline
     from benchmarks.compact import GLASSES
     from benchmarks.solver import NAMES
 
@@ -49,7 +52,7 @@ def full() -> Suite:
 
     def interpolations():
         for name in ("amber_glass", *measured):
-            yield from interpolation.records(name, samples=1439, wavelengths=31, folds=interpolation.FOLDS)
+            yield from interpolation.records(name, samples=1439, wavelengths=31, folds=3)
 
     return {
         "resampling": resampling,
@@ -58,6 +61,7 @@ def full() -> Suite:
         "representation": lambda: (record for name in GLASSES for record in compact.records(name)),
         "pipeline": lambda: pipeline.records(pipeline.sweeps(("guided", "paper"), len(os.sched_getaffinity(0)))),
         "cold start": pipeline.cold_records,
+        "roofline": roofline.records,
     }
 
 
@@ -76,19 +80,25 @@ def main() -> None:
     print(f"Python {shared['python']}, {versions}; {shared['cpu']}, {shared['threads']} threads, load {shared['load']}")
     for package in missing():
         print(f"missing: {package} (pip install -e '.[bench]'): its rows are left out")
-    start, found = time.perf_counter(), []
     groups = quick() if args.suite == "quick" else full()
-    for name, work in groups.items():
-        if args.only and name not in args.only:
-            continue
-        some = list(work())
-        print_tables(some)
-        print(f"{name}: {len(some)} records after {time.perf_counter() - start:.0f} s", flush=True)
-        found += some
-    if args.output:
-        args.output.parent.mkdir(parents=True, exist_ok=True)
-        args.output.write_text("".join(as_line(record, shared) + "\n" for record in found))
-        print(f"{len(found)} records in {args.output}")
+    unknown = set(args.only or ()) - set(groups)
+    if unknown:
+        parser.error(f"found group {', '.join(sorted(unknown))}, expected some of {', '.join(groups)}")
+    start = time.perf_counter()
+    with contextlib.ExitStack() as stack:
+        if args.output:
+            args.output.parent.mkdir(parents=True, exist_ok=True)
+            lines = stack.enter_context(args.output.open("w"))
+        for name, work in groups.items():
+            if args.only and name not in args.only:
+                continue
+            some = []
+            for record in work():
+                some.append(record)
+                if args.output:
+                    print(as_line(record, shared), file=lines, flush=True)
+            print_tables(some)
+            print(f"{name}: {len(some)} records after {time.perf_counter() - start:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

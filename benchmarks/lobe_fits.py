@@ -36,7 +36,7 @@ def records(lanes: int, *, loop_lanes: int, repeats: int = 3) -> Iterator[Record
     bank = width_bank(np.radians(7.5) ** 2)
     limits = jnp.asarray(bank[[0, -1]])
 
-    columns = jnp.exp(-exponent / bank[:, None])
+    columns = jnp.exp(-exponent[None] / bank[:, None])
     size = jnp.sum(columns**2, axis=1)
 
     def best_start(lane):

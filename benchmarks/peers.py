@@ -6,6 +6,8 @@ from importlib.util import find_spec
 import numpy as np
 
 PEERS = {"optax": "optax", "osqp": "osqp", "sklearn": "scikit-learn"}
+OSQP_SECONDS = 60.0
+KERNEL_POINTS = 400  # that a Gaussian process' kernel is fitted to
 
 
 def missing() -> list[str]:
@@ -27,7 +29,10 @@ def optax_solver(triangle: np.ndarray, target: np.ndarray) -> Callable[[int], np
 
 
 def osqp_solver(matrix: np.ndarray, rhs: np.ndarray) -> Callable[[float], np.ndarray] | None:
-    """Return OSQP of 1/2 x'A'A x - x'A'b, lane after lane, as a function of its tolerance; None without OSQP."""
+    """Return OSQP of 1/2 x'A'A x - x'A'b, lane after lane, as a function of its tolerance; None without OSQP.
+
+    A lane ends after `OSQP_SECONDS` wherever it is; its residual says where that was.
+    """
     if find_spec("osqp") is None:
         return None
     import osqp
@@ -43,6 +48,7 @@ def osqp_solver(matrix: np.ndarray, rhs: np.ndarray) -> Callable[[float], np.nda
             problem = osqp.OSQP()
             limits = {"l": np.zeros(size), "u": np.full(size, np.inf)}
             settings = {"eps_abs": tolerance, "eps_rel": tolerance, "max_iter": 20_000, "verbose": False}
+            settings["time_limit"] = OSQP_SECONDS
             problem.setup(P=upper, q=-column, A=identity, **limits, **settings)
             found = problem.solve()
             columns.append(np.where(-found.y > found.x, 0.0, found.x))  # at the bound, where its multiplier says so
@@ -52,15 +58,21 @@ def osqp_solver(matrix: np.ndarray, rhs: np.ndarray) -> Callable[[float], np.nda
 
 
 def gaussian_process() -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None:
-    """Return scikit-learn's Gaussian process (points, values, queries) -> values; None without scikit-learn."""
+    """Return scikit-learn's Gaussian process (points, values, queries) -> values; None without scikit-learn.
+
+    Its kernel is fitted to the mean of the columns at some of the points: at all of them, and to 31 columns at once,
+    it takes minutes. All points and columns are then predicted from with this kernel.
+    """
     if find_spec("sklearn") is None:
         return None
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
     def predict(points: np.ndarray, values: np.ndarray, queries: np.ndarray) -> np.ndarray:
-        kernel = ConstantKernel(1.0) * RBF(np.full(points.shape[1], 0.3)) + WhiteKernel(1e-3)
-        model = GaussianProcessRegressor(kernel, normalize_y=True, random_state=0)
+        kernel = ConstantKernel(1.0) * RBF(np.full(points.shape[1], 0.3), (0.03, 30.0)) + WhiteKernel(1e-3)
+        some = slice(None, None, -(-len(points) // KERNEL_POINTS))
+        fitted = GaussianProcessRegressor(kernel, normalize_y=True).fit(points[some], values[some].mean(axis=1))
+        model = GaussianProcessRegressor(fitted.kernel_, optimizer=None, normalize_y=True)
         return model.fit(points, values).predict(queries)
 
     return predict

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "optimistix", "jaxopt", "optax", "osqp", "scikit-learn")
+SECONDS = ("set_up_seconds", "compile_seconds", "seconds_min", "seconds_median", "seconds_spread")
+MEASURED = (*SECONDS, "peak_bytes", "error")
 
 
 class Timing(NamedTuple):
@@ -54,10 +56,12 @@ class Record:
     more: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        """Refuse a record without a time or an error."""
-        if not (math.isfinite(self.error) and math.isfinite(self.seconds_min)):
-            found = f"error {self.error}, seconds {self.seconds_min}"
-            raise ValueError(f"{self.problem}, {self.method}: {found}: both must be finite")
+        """Refuse a record without a time, an error or a memory."""
+        found = {name: getattr(self, name) for name in MEASURED}
+        wrong = [f"{name} {value}" for name, value in found.items() if not (math.isfinite(value) and value >= 0)]
+        if wrong or not self.peak_bytes:
+            what = ", ".join(wrong) or "peak_bytes 0"
+            raise ValueError(f"{self.problem}, {self.method}: found {what}: all must be finite, none below 0")
 
 
 def record_of(timing: Timing, *, set_up_seconds: float = 0.0, **named: Any) -> Record:
@@ -107,11 +111,14 @@ def peak_bytes() -> int:
 
 
 def machine() -> dict[str, Any]:
-    """What the records of one run share: versions, processor, threads, commit."""
+    """What the records of one run share: versions, processor, device, threads, commit."""
+    import jax
+
     return {
         "python": platform.python_version(),
         "versions": {name: found for name in PACKAGES if (found := version_of(name))},
         "cpu": _cpu(),
+        "device": jax.devices()[0].device_kind,  # of JAX; "cpu" where there is no accelerator
         "threads": int(os.environ.get("NPROC", len(os.sched_getaffinity(0)))),
         "load": round(os.getloadavg()[0], 2),
         "commit": _commit(),
@@ -132,11 +139,16 @@ def as_line(record: Record, shared: Mapping[str, Any]) -> str:
     return json.dumps(dataclasses.asdict(record) | dict(shared), sort_keys=True)
 
 
-def read_lines(path: str | Path) -> list[Record]:
-    """Read the records of a file of JSON lines."""
+def read_runs(path: str | Path) -> list[tuple[Record, dict[str, Any]]]:
+    """Read the records of a file of JSON lines, each with what its run shares."""
     names = [field.name for field in dataclasses.fields(Record)]
     lines = [json.loads(line) for line in Path(path).read_text().splitlines()]
-    return [Record(**{name: line[name] for name in names}) for line in lines]
+    return [(Record(**{name: line.pop(name) for name in names}), line) for line in lines]
+
+
+def read_lines(path: str | Path) -> list[Record]:
+    """Read the records of a file of JSON lines."""
+    return [record for record, _ in read_runs(path)]
 
 
 def _cpu() -> str:

@@ -7,6 +7,7 @@ import numpy as np
 from benchmarks.records import Record
 
 EXPONENT_FROM = 3  # points of a sweep
+USUAL = "usual size"  # the setting that all sweeps of a problem share
 
 
 def print_tables(records: list[Record]) -> None:
@@ -41,15 +42,22 @@ def row(record: Record) -> str:
 
 
 def exponents(records: list[Record]) -> Iterable[str]:
-    """Lines with the fitted exponent of the warm time over every size that a method's records sweep."""
+    """Lines with the fitted exponents of time and memory over every size that a method's records sweep.
+
+    A sweep is the records whose setting names the size, and the usual one. Its largest few count.
+    """
     for method in unique(record.method for record in records):
         some = [record for record in records if record.method == method]
         for what in some[0].size:
-            swept = [record for record in some if record.setting.startswith(what)]
+            swept = [record for record in some if record.setting == USUAL or record.setting.startswith(what)]
+            swept = sorted(swept, key=lambda record: record.size[what])[-EXPONENT_FROM:]
             if len({record.size[what] for record in swept}) >= EXPONENT_FROM:
-                size = np.log([record.size[what] for record in swept[-EXPONENT_FROM:]])
-                seconds = np.log([record.seconds_min for record in swept[-EXPONENT_FROM:]])
-                yield f"{method}: exponent of the warm time over {what} {np.polyfit(size, seconds, 1)[0]:.2f}"
+                size = np.log([record.size[what] for record in swept])
+                time, memory = (
+                    np.polyfit(size, np.log([getattr(record, name) for record in swept]), 1)[0]
+                    for name in ("seconds_min", "peak_bytes")
+                )
+                yield f"{method}: over {what}, exponent of the warm time {time:.2f}, of the peak memory {memory:.2f}"
 
 
 def unique(names: Iterable[str]) -> list[str]:

@@ -8,6 +8,7 @@ from sbrdf_jax.errors import UserError
 from sbrdf_jax.formats.text import numbered_lines, shorten
 
 COLUMNS = ("theta_i_deg", "theta_o_deg", "phi_o_deg")
+LONGEST = 40  # characters of a number that a message shows
 
 
 def read_directions(path: Path) -> tuple[list[list[str]], list[list[float]]]:
@@ -55,9 +56,10 @@ def _angle(where: str, column: str, word: str) -> float:
         angle = float(word)
     except ValueError:
         raise UserError(f"{where}: {column}: found {shorten(word)}, expected a number") from None
+    found = word if len(word) <= LONGEST else shorten(word)  # 400 nines are a number too
     if not math.isfinite(angle):
-        raise UserError(f"{where}: {column}: found {word}, expected a finite number")
+        raise UserError(f"{where}: {column}: found {found}, expected a finite number")
     if column != "phi_o_deg" and not 0 <= angle <= 90:
         below = ", below the horizon" if angle > 90 else ""
-        raise UserError(f"{where}: {column}: found {word}{below}, expected 0 to 90")
+        raise UserError(f"{where}: {column}: found {found}{below}, expected 0 to 90")
     return angle

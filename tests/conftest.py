@@ -23,6 +23,12 @@ SHARED = ROOT.parent / "shared"  # measured data that are not part of the reposi
 IN_CI = os.environ.get("CI", "").lower() in ("1", "true")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Let the nightly script ask for more damaged files than the usual run reads, and for a record of them."""
+    parser.addoption("--fuzz-inputs", type=int, metavar="N", help="damaged files for each reader; unset: some hundred")
+    parser.addoption("--fuzz-records", metavar="FILE", help="append a line for each reader, for benchmarks.pages")
+
+
 def shared_file(name: str) -> Path:
     """Path of a measured file below `SHARED`; skips the test by name where it is absent, fails in CI."""
     path = SHARED / name

@@ -71,6 +71,7 @@ def test_no_directions_make_no_rows(tmp_path, result):
         (["30,-1,0"], [], "at.csv:2: row 0: theta_o_deg: found -1, expected 0 to 90"),
         (["91,1,0"], [], "row 0: theta_i_deg"),
         (["30,45,180", "30,nan,0"], [], "row 1: theta_o_deg: found nan, expected a finite number"),
+        (["30," + "9" * 400 + ",0"], [], "theta_o_deg: found '" + "9" * 37 + "...', expected a finite number"),
         (["30,45,inf"], [], "row 0: phi_o_deg"),
         (["30,45,x"], [], "row 0: phi_o_deg: found 'x', expected a number"),
         (["30,45"], [], "row 0: found 2 columns, expected 3"),
