@@ -28,12 +28,12 @@ from sbrdf_jax.interpolation import neighbours
 from sbrdf_jax.quadrature import Quadrature
 from sbrdf_jax.records import GriddedBRDF, SpectralField
 from sbrdf_jax.resampling.guided.error_model import ResidualScale
-from sbrdf_jax.resampling.guided.field import LAST_AXIS, GuidedField, MeasuredLobe
+from sbrdf_jax.resampling.guided.field import LAST_AXIS, GuidedField, WholeSpectrum
 from sbrdf_jax.resampling.guided.lobe_model import SHAPE_NAMES, LobeModel
 from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, mirror
 from sbrdf_jax.scores import SCORE_TEXT
 
-GUIDED_PARTS = {"lobe": LobeModel, "variance": ModeVariance, "scale": ResidualScale, "measured": MeasuredLobe}
+GUIDED_PARTS = {"lobe": LobeModel, "variance": ModeVariance, "scale": ResidualScale, "measured": WholeSpectrum}
 WAVELENGTHS_A_CHUNK = 8  # a wavelength between the measured ones needs four
 _ANGLES = ("theta_i", "theta_o", "phi_o")
 _PROOF = ("kkt_residual", "num_steps", "status")

@@ -17,7 +17,7 @@ from sbrdf_jax.errors import UserError
 from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_standard_error
 from sbrdf_jax.layout import read_guided
 from sbrdf_jax.resampling.guided.error_model import ResidualScale
-from sbrdf_jax.resampling.guided.field import GuidedField, MeasuredLobe
+from sbrdf_jax.resampling.guided.field import GuidedField, WholeSpectrum
 from sbrdf_jax.resampling.guided.lanes import take_field
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel
 from sbrdf_jax.resampling.guided.nodes import GRIDS, mirror, mode_variance
@@ -53,7 +53,9 @@ def guided_field(rng, group=6, member=8) -> GuidedField:
         model_residual=rng.uniform(0, 1e-6, lanes),
         reciprocity_cost=np.array(1.0),
         curve=rng.uniform(size=(2, 5)),
-        measured=MeasuredLobe(MEASURED_NM, amplitude, np.zeros(lanes)),
+        measured=WholeSpectrum(
+            MEASURED_NM, amplitude, np.zeros(lanes), rng.normal(size=(lanes, 3)), rng.normal(size=(3, lanes))
+        ),
         **residual,
     )
 

@@ -27,6 +27,7 @@ from sbrdf_jax.resampling.guided.lobe_fit import density_weights, fit_lobe_model
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
 from sbrdf_jax.resampling.guided.nodes import ModeVariance
 from sbrdf_jax.resampling.guided.smoothing import choose_smoothing
+from sbrdf_jax.resampling.guided.spectrum import SpectralFilter, spectral_filter
 
 CALIBRATION_GROUPS = 5
 
@@ -44,10 +45,11 @@ class Estimates(NamedTuple):
     noise: np.ndarray  # [centre] variance of z relative to the prior's
     curve: tuple[tuple[float, float], ...]
     reciprocity_cost: float
+    spectral_filter: SpectralFilter
     scale: ResidualScale
     whiten: np.ndarray  # [centre, centre] inverse Cholesky factor of prior plus noise
     inverse: np.ndarray  # [centre, centre] of prior plus noise
-    residual: np.ndarray  # [centre, wavelength] z minus the lobe model's
+    residual: np.ndarray  # [centre, wavelength] filtered z minus the lobe model's
     model: np.ndarray  # [centre, wavelength] z of the lobe model
     node_variance: dict[bytes, np.ndarray]  # of the nodes that were asked for, by grid: the same at every wavelength
 
@@ -92,6 +94,8 @@ def estimate(
     factor = np.ones(centres.count)
     factor[seen] = noise_factors(half[seen], *centres.angles[:2, seen], choice.left_out[seen])
     noise = centres.noise(choice.noise) * factor
+    spectra = spectral_filter((model + residual)[seen], choice.left_out[seen])
+    residual = _filtered(spectra, residual, model)
     whiten = whitener(centres.prior(choice.variance), noise)
     lower = lower_product(whiten)
     inverse = mirror_lower(lower)
@@ -111,6 +115,7 @@ def estimate(
         noise=noise,
         curve=choice.curve,
         reciprocity_cost=choice.reciprocity_cost,
+        spectral_filter=spectra,
         scale=_calibrate(centres, samples, model + residual - out, spread, floor),
         whiten=whiten,
         inverse=inverse,
@@ -131,6 +136,11 @@ def _split(centres: Centres, z_sample: np.ndarray, at_samples, lobe: LobeModel, 
     residual = centres.mean(z_sample - lobe_log_value(lobe, at_samples, floor))
     seen = (centres.number > 0)[:, None]
     return residual, np.where(seen, lobe_log_value(lobe, centres.at, floor), 0.0)
+
+
+def _filtered(spectra: SpectralFilter, residual: np.ndarray, model: np.ndarray) -> np.ndarray:
+    """What the lobe model leaves of the filtered logarithms; both are 0 at centres without samples."""
+    return spectra(model + residual) - model
 
 
 def _left_out_fifths(seen: np.ndarray, lower: np.ndarray, dual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -162,6 +172,8 @@ def restore_estimates(field: GuidedField, samples: RawSamples, centres: Centres)
     field = jax.tree.map(np.asarray, field)
     lobe = LobeModel(field.lobe.shape, field.measured.log_amplitude)
     residual, model = _split(centres, *_sample_logarithm(samples, floor, centres), lobe, floor)
+    spectra = SpectralFilter(field.measured.to_component, field.measured.from_component)
+    residual = _filtered(spectra, residual, model)
     noise = field.noise.reshape(-1)
     whiten = whitener(centres.prior(field.variance), noise)
     return Estimates(
@@ -175,6 +187,7 @@ def restore_estimates(field: GuidedField, samples: RawSamples, centres: Centres)
         noise=noise,
         curve=tuple(map(tuple, field.curve.T)),
         reciprocity_cost=float(field.reciprocity_cost),
+        spectral_filter=spectra,
         scale=field.scale,
         whiten=whiten,
         inverse=mirror_lower(lower_product(whiten)),

@@ -37,17 +37,19 @@ DIRECTIONS_AT_A_TIME = 1024
 WHITEN_BLOCK = 256  # rows of a triangular matrix that are multiplied as one full block
 MOST_GATHERED = 8  # wavelengths; measured: 1.8 us a direction against 6.1 for 1, 5.0 and 7.4 for 6, 46 and 16 for 31
 
-NEVER_EVALUATED = ("multiplier", "model_residual", "reciprocity_cost", "curve")
+NEVER_EVALUATED = ("multiplier", "model_residual", "reciprocity_cost", "curve", "measured")
 LAST_AXIS = ("wavelength_nm", "half", "azimuth", "multiplier", "model_residual")  # is the wavelength's, in a field
 
 
 @pytree()
-class MeasuredLobe:
-    """The lobe model at all measured wavelengths: with it a later run can solve those that this one skipped."""
+class WholeSpectrum:
+    """What is known of all measured wavelengths: with it a later run can solve those that this one skipped."""
 
     wavelength_nm: Any  # [measured]
     log_amplitude: Any  # [4, measured]
     model_residual: Any  # [measured]
+    to_component: Any  # [measured, component] projection of the spectra, none where they are left as they are
+    from_component: Any  # [component, measured]
 
 
 @pytree()
@@ -74,7 +76,7 @@ class GuidedField:
     model_residual: Any  # [wavelength] relative gradient norm of the lobe model's fit
     reciprocity_cost: Any  # left-out errors with nodes tied by reciprocity over those without; 1 where not tied
     curve: Any  # [2, trial] noise and left-out error of z
-    measured: MeasuredLobe
+    measured: Any  # WholeSpectrum
 
 
 def evaluated_part(field: GuidedField) -> GuidedField:

@@ -10,7 +10,7 @@ from sbrdf_jax.resampling.guided.bounds import solve_bounded
 from sbrdf_jax.resampling.guided.centres import Centres
 from sbrdf_jax.resampling.guided.covariance import node_values
 from sbrdf_jax.resampling.guided.estimates import Estimates
-from sbrdf_jax.resampling.guided.field import GuidedField, MeasuredLobe
+from sbrdf_jax.resampling.guided.field import GuidedField, WholeSpectrum
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel
 from sbrdf_jax.resampling.guided.nodes import mirror
 
@@ -58,6 +58,8 @@ def solve_field(estimates: Estimates, centres: Centres, needed: np.ndarray, tole
         model_residual=estimates.model_residual[needed],
         reciprocity_cost=np.asarray(estimates.reciprocity_cost),
         curve=np.transpose(estimates.curve),
-        measured=MeasuredLobe(estimates.wavelength_nm, amplitude, estimates.model_residual),
+        measured=WholeSpectrum(
+            estimates.wavelength_nm, amplitude, estimates.model_residual, *estimates.spectral_filter
+        ),
     )
     return GuidedFit(field, bounded.kkt_residual, bounded.num_steps, bounded.status, estimates.whiten)
