@@ -110,17 +110,24 @@ def test_each_step_is_plain_least_squares(rng):
         matrix = np.stack([(root * make(unit)).ravel() for unit in units], axis=1)
         return np.linalg.lstsq(matrix, (root * value).ravel())[0].reshape(shape)
 
-    core, gain = fit.solve_core(u, v, fit.project(w))
+    solved = fit.solve_core(u, v, fit.project(w))
+    core, gain = solved.value, solved.gain
     expected = plain(lambda c: model(u, v, w, c), core.shape)
     loose = 1e-2  # a ridge of 1e-5 of the diagonal
     np.testing.assert_allclose(core, expected, rtol=0, atol=loose)
     left = (weight[..., None] * (value - model(u, v, w, core)) ** 2).sum()
     assert abs(energy - gain.sum() - left) < loose * energy
 
+    for mode, factor in enumerate((u, v, w)):
+        wide = np.concatenate([factor, rng.normal(size=(len(factor), 1))], axis=1)
+        a, b, q = (wide if k == mode else f for k, f in enumerate((u, v, w)))
+        more = fit.solve_core(a, b, fit.project(q)).gain
+        np.testing.assert_allclose(fit.added_gain(solved, (u, v, w), mode, wide), more - gain, rtol=1e-8)
+
     once, gained = fit.sweep([u, v, w], channels)
     assert gained == pytest.approx(gain.sum())
     by_hand = [u, v, w]
-    core = fit.solve_core(u, v, fit.project(w))[0]
+    core = solved.value
     for mode in range(3):
 
         def with_factor(factor, mode=mode, core=core):

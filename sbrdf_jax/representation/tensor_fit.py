@@ -46,8 +46,20 @@ class Normal(NamedTuple):
 class Projection(NamedTuple):
     """Sums over azimuths for a directional factor, for every pair (i, o)."""
 
-    gram: Float[np.ndarray, "i o qq"]
+    gram: Float[np.ndarray, "i o q q"]
     moment: Float[np.ndarray, "i o q channel"]
+
+
+class SolvedCore(NamedTuple):
+    """The best core for given factors, and what tells how much another column would add."""
+
+    value: Float[np.ndarray, "a b q channel"]
+    gain: Float[np.ndarray, " channel"]  # by how much each channel lowers the error
+    at: tuple[np.ndarray, np.ndarray]  # [i, a] and [o, b]: the factors at the rows
+    projection: Projection
+    root: Float[np.ndarray, "cell cell"]  # lower Cholesky factor of the scaled normal matrix
+    scale: Float[np.ndarray, " cell"]
+    right: Float[np.ndarray, "cell channel"]  # scaled right side
 
 
 class TensorFit:
@@ -84,21 +96,48 @@ class TensorFit:
 
     def project(self, w) -> Projection:
         """Return what the directional factor makes of Gram matrices and moments."""
-        gram = w.T @ self.normal.gram @ w
-        return Projection(gram.reshape(*gram.shape[:2], -1), w.T @ self.normal.moment)
+        return Projection(w.T @ self.normal.gram @ w, w.T @ self.normal.moment)
 
-    def solve_core(self, u, v, projection: Projection) -> tuple[np.ndarray, np.ndarray]:
-        """Return the core, and by how much each channel lowers the error."""
-        gram, moment = projection
-        at_i, at_o = self.normal.theta_i @ u, self.normal.theta_o @ v
-        a, b, q, c = u.shape[1], v.shape[1], moment.shape[2], moment.shape[3]
-        matrix = np.tensordot(np.tensordot(_pairs(at_i), gram, (0, 0)), _pairs(at_o), (1, 0))  # [aa, qq, bb]
-        matrix = matrix.reshape(a, a, q, q, b, b).transpose(0, 4, 2, 1, 5, 3).reshape(a * b * q, -1)
-        right = np.tensordot(np.tensordot(at_i, moment, (0, 0)), at_o, (1, 0))  # [a, q, c, b]
-        right = right.transpose(0, 3, 1, 2).reshape(a * b * q, c)
-        core = _solve(matrix, right)
+    def solve_core(self, u, v, projection: Projection) -> SolvedCore:
+        """Return the core that fits best."""
+        at = self.normal.theta_i @ u, self.normal.theta_o @ v
+        matrix, right = _core_matrix(at, at, projection.gram), _core_right(at, projection.moment)
+        core, root, scale = _solve(matrix, right)
         gain = 2 * (core * right).sum(axis=0) - (core * (matrix @ core)).sum(axis=0)
-        return core.reshape(a, b, q, c), gain
+        value = core.reshape(u.shape[1], v.shape[1], projection.moment.shape[2], -1)
+        return SolvedCore(value, gain, at, projection, root, scale, scale[:, None] * right)
+
+    def added_gain(self, solved: SolvedCore, factors, mode: int, wide) -> Float[np.ndarray, " channel"]:
+        """Return by how much each channel lowers the error further if one factor has one more column.
+
+        The unknowns that it brings are solved for by their Schur complement; what is factorised stays.
+
+        Args:
+            solved: The core of `factors`.
+            factors: The factors.
+            mode: Which factor is widened.
+            wide: The widened factor, its new column last.
+        """
+        n, column = self.normal, wide[:, -1:]
+        new, held, gram, moment = list(solved.at), solved.at, solved.projection.gram, solved.projection.moment
+        if mode < 2:
+            new[mode] = (n.theta_i, n.theta_o)[mode] @ column
+            own = gram
+        else:
+            along = column.T @ n.gram  # [i, o, 1, direction_function]
+            gram, own, moment = along @ factors[2], along @ column, column.T @ n.moment
+        across = _core_matrix(new, held, gram) * solved.scale
+        block, right = _core_matrix(new, new, own), _core_right(new, moment)
+        diagonal = RIDGE * np.diag(block)
+        known = solved.value.reshape(len(solved.scale), -1) / solved.scale[:, None]
+        explained = scipy.linalg.solve_triangular(solved.root, across.T, lower=True, check_finite=False)
+        schur = block + np.diag(diagonal) - explained.T @ explained
+        added = scipy.linalg.solve(schur, right - across @ known, assume_a="pos", check_finite=False)
+        known -= scipy.linalg.solve_triangular(
+            solved.root, explained @ added, lower=True, trans="T", check_finite=False
+        )
+        both = (known * (solved.right + RIDGE * known)).sum(axis=0)
+        return both + (added * (right + diagonal[:, None] * added)).sum(axis=0) - solved.gain
 
     def sweep(self, factors, channels: int) -> tuple[list[np.ndarray], float]:
         """Renew the core and each factor once, by the first `channels` alone.
@@ -108,8 +147,8 @@ class TensorFit:
         """
         u, v, w = factors
         n, projection = self.normal, self.project(w)
-        core, gain = self.solve_core(u, v, projection)
-        core = core[..., :channels]
+        solved = self.solve_core(u, v, projection)
+        core = solved.value[..., :channels]
         gram, moment = projection.gram, projection.moment[..., :channels]
         a, b, q, c = core.shape
         part = np.tensordot(n.theta_o @ v, core, (1, 1)).transpose(0, 2, 3, 1)  # [o, q, c, a]
@@ -127,8 +166,8 @@ class TensorFit:
         size = n.gram.shape[-1]
         matrix = _unpair(n.gram.reshape(-1, size * size).T @ squares, size, q)
         right = np.tensordot(n.moment[..., :channels], part, ((0, 1, 3), (0, 1, 3)))
-        w, _ = self.orthonormal(2, _solve(matrix, right.reshape(-1, 1)).reshape(size, q))
-        return [u, v, w], gain[:channels].sum()
+        w, _ = self.orthonormal(2, _solve(matrix, right.reshape(-1, 1))[0].reshape(size, q))
+        return [u, v, w], solved.gain[:channels].sum()
 
     def amplitudes(self, u, v, core) -> Float[np.ndarray, "i o q channel"]:
         """Return what multiplies the directional factor at every pair of polar angles."""
@@ -160,9 +199,27 @@ class TensorFit:
         return found
 
 
-def _pairs(x):
-    """Return all products of two columns, [row, column * column]."""
-    return (x[:, :, None] * x[:, None, :]).reshape(len(x), -1)
+def _pairs(x, y):
+    """Return all products of a column of each, [row, column * column]."""
+    return (x[:, :, None] * y[:, None, :]).reshape(len(x), -1)
+
+
+def _core_matrix(one, other, gram):
+    """Return the normal matrix [a b q, a b q] of the cells of two cores, by their polar factors at the rows.
+
+    `gram` [i, o, q, q] holds the products of the one's and the other's directional factors.
+    """
+    by_i, by_o = (_pairs(x, y) for x, y in zip(one, other, strict=True))
+    matrix = np.tensordot(np.tensordot(by_i, gram.reshape(*gram.shape[:2], -1), (0, 0)), by_o, (1, 0))  # [aa, qq, bb]
+    a, b = ((x.shape[1], y.shape[1]) for x, y in zip(one, other, strict=True))
+    cells = a[0] * b[0] * gram.shape[2]
+    return matrix.reshape(*a, *gram.shape[2:], *b).transpose(0, 4, 2, 1, 5, 3).reshape(cells, -1)
+
+
+def _core_right(at, moment):
+    """Return the right side [a b q, channel] of a core's normal equations."""
+    right = np.tensordot(np.tensordot(at[0], moment, (0, 0)), at[1], (1, 0))  # [a, q, c, b]
+    return right.transpose(0, 3, 1, 2).reshape(-1, moment.shape[3])
 
 
 def _channel_pairs(part):
@@ -180,16 +237,22 @@ def _unpair(matrix, m, n):
 def _solve_mode(functions, matrix, right):
     """Solve for the coefficients of a factor's functions, from normal equations [row, rank rank] of its rows."""
     size, rank = functions.shape[1], right.shape[1]
-    whole = _unpair(_pairs(functions).T @ matrix, size, rank)
-    return _solve(whole, (functions.T @ right).reshape(-1, 1)).reshape(size, rank)
+    whole = _unpair(_pairs(functions, functions).T @ matrix, size, rank)
+    return _solve(whole, (functions.T @ right).reshape(-1, 1))[0].reshape(size, rank)
 
 
 def _solve(matrix, right):
-    """Solve normal equations after scaling their diagonal to 1, with a small ridge."""
+    """Solve normal equations after scaling their diagonal to 1, with a small ridge.
+
+    Returns:
+        The solution, the lower Cholesky factor of the scaled matrix, and the scale.
+    """
     diagonal = np.diag(matrix)
     scale = 1 / np.sqrt(np.where(diagonal > NOTHING * diagonal.max(), diagonal, 1.0))
     scaled = matrix * scale[:, None] * scale + RIDGE * np.eye(len(matrix))
-    _, found, failed = scipy.linalg.lapack.dposv(scaled, scale[:, None] * right, lower=1, overwrite_a=1, overwrite_b=1)
+    root, found, failed = scipy.linalg.lapack.dposv(
+        scaled, scale[:, None] * right, lower=1, overwrite_a=1, overwrite_b=1
+    )
     if failed:
         raise np.linalg.LinAlgError("normal equations are not positive definite")
-    return scale[:, None] * found
+    return scale[:, None] * found, root, scale

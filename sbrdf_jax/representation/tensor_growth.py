@@ -32,16 +32,15 @@ def grow(
     energy = fit.normal.energy
     factors, channels = _settle(fit, fit.start(), first_channels), first_channels
     while True:
-        projection = fit.project(factors[2])
-        core, gain = fit.solve_core(*factors[:2], projection)
-        error = energy - gain[:channels].sum()
-        found = Factors(*factors, core[..., :channels])
+        solved = fit.solve_core(*factors[:2], fit.project(factors[2]))
+        error = energy - solved.gain[:channels].sum()
+        found = Factors(*factors, solved.value[..., :channels])
         enough = is_enough(found)
         if error <= NO_ERROR * energy or enough:
             break
         held = numbers(*[f.shape[1] for f in factors], channels)
         steps = []  # score, the error taken away, what it leads to
-        for mode, wide in enumerate(fit.widened(factors, core[..., :channels])):
+        for mode, wide in enumerate(fit.widened(factors, found.core)):
             if wide is None:
                 continue
             trial = [wide if k == mode else f for k, f in enumerate(factors)]
@@ -49,19 +48,19 @@ def grow(
             cost = numbers(*ranks, channels) - held
             if np.prod(ranks) > MOST_CELLS or held + cost > budget:
                 continue
-            along = fit.project(wide) if mode == 2 else projection
-            gained = fit.solve_core(*trial[:2], along)[1][:channels].sum() - gain[:channels].sum()
+            gained = fit.added_gain(solved, factors, mode, wide)[:channels].sum()
             steps.append((_score(error, gained, cost), gained, trial, channels))
-        if channels < len(gain):
+        if channels < len(solved.gain):
             cost = numbers(*[f.shape[1] for f in factors], channels + 1) - held
             if held + cost <= budget:
-                steps.append((_score(error, gain[channels], cost), gain[channels], factors, channels + 1))
+                gained = solved.gain[channels]
+                steps.append((_score(error, gained, cost), gained, factors, channels + 1))
         _, gained, wider, wider_channels = max(steps, key=lambda step: step[0], default=(0.0, 0.0, factors, channels))
         if gained < LEAST_GAIN * error:
             break
         factors, channels = fit.sweep(wider, wider_channels)[0], wider_channels
     factors = _settle(fit, factors, channels)
-    settled = Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2]))[0][..., :channels])
+    settled = Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2])).value[..., :channels])
     return found if enough and not is_enough(settled) else settled  # settled for all, not for the worst
 
 
