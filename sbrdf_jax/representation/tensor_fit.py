@@ -128,7 +128,7 @@ class TensorFit:
             gram, own, moment = along @ factors[2], along @ column, column.T @ n.moment
         across = _core_matrix(new, held, gram) * solved.scale
         block, right = _core_matrix(new, new, own), _core_right(new, moment)
-        diagonal = RIDGE * np.diag(block)
+        diagonal = RIDGE * _living(np.diag(block))
         known = solved.value.reshape(len(solved.scale), -1) / solved.scale[:, None]
         explained = scipy.linalg.solve_triangular(solved.root, across.T, lower=True, check_finite=False)
         schur = block + np.diag(diagonal) - explained.T @ explained
@@ -241,18 +241,20 @@ def _solve_mode(functions, matrix, right):
     return _solve(whole, (functions.T @ right).reshape(-1, 1))[0].reshape(size, rank)
 
 
+def _living(diagonal):
+    """Return a diagonal with 1 for columns that have died out."""
+    return np.where(diagonal > NOTHING * diagonal.max(), diagonal, 1.0)
+
+
 def _solve(matrix, right):
     """Solve normal equations after scaling their diagonal to 1, with a small ridge.
 
     Returns:
         The solution, the lower Cholesky factor of the scaled matrix, and the scale.
     """
-    diagonal = np.diag(matrix)
-    scale = 1 / np.sqrt(np.where(diagonal > NOTHING * diagonal.max(), diagonal, 1.0))
-    scaled = matrix * scale[:, None] * scale + RIDGE * np.eye(len(matrix))
-    root, found, failed = scipy.linalg.lapack.dposv(
-        scaled, scale[:, None] * right, lower=1, overwrite_a=1, overwrite_b=1
-    )
+    scale = 1 / np.sqrt(_living(np.diag(matrix)))
+    scaled, right = matrix * scale[:, None] * scale + RIDGE * np.eye(len(matrix)), scale[:, None] * right
+    root, found, failed = scipy.linalg.lapack.dposv(scaled, right, lower=1, overwrite_a=1, overwrite_b=1)
     if failed:
         raise np.linalg.LinAlgError("normal equations are not positive definite")
     return scale[:, None] * found, root, scale
