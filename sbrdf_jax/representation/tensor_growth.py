@@ -1,12 +1,14 @@
-"""Which ranks a lobe tensor has: grown one at a time, by the error that each stored number takes away."""
+"""Which ranks a lobe tensor has: grown step by step, by the error that each stored number takes away."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from sbrdf_jax.representation.tensor_fit import Factors, TensorFit
 
 MOST_CELLS = 900  # of the core for one channel; its normal equations have so many unknowns
+ALIKE = 0.8  # of the best step's score: such steps are taken with it
 LEAST_GAIN = 2e-3  # of the squared error; a step that gains less is noise, and growth ends
 MOST_SWEEPS, SWEEP_GAIN = 30, 0.02  # before and after the growth; of the squared error
 NO_ERROR = 1e-24  # squared, relative; below it is rounding
@@ -31,6 +33,11 @@ def grow(
     """
     energy = fit.normal.energy
     factors, channels = _settle(fit, fit.start(), first_channels), first_channels
+
+    def fits(factors, channels: int) -> bool:
+        ranks = [f.shape[1] for f in factors]
+        return np.prod(ranks) <= MOST_CELLS and numbers(*ranks, channels) <= budget
+
     while True:
         solved = fit.solve_core(*factors[:2], fit.project(factors[2]))
         error = energy - solved.gain[:channels].sum()
@@ -38,30 +45,49 @@ def grow(
         enough = is_enough(found)
         if error <= NO_ERROR * energy or enough:
             break
-        held = numbers(*[f.shape[1] for f in factors], channels)
-        steps = []  # score, the error taken away, what it leads to
-        for mode, wide in enumerate(fit.widened(factors, found.core)):
-            if wide is None:
+        held, steps = numbers(*found.ranks, channels), []
+        for step in _steps(fit, found, len(solved.gain)):
+            trial = step.taken(factors, channels)
+            if not fits(*trial):
                 continue
-            trial = [wide if k == mode else f for k, f in enumerate(factors)]
-            ranks = [f.shape[1] for f in trial]
-            cost = numbers(*ranks, channels) - held
-            if np.prod(ranks) > MOST_CELLS or held + cost > budget:
-                continue
-            gained = fit.added_gain(solved, factors, mode, wide)[:channels].sum()
-            steps.append((_score(error, gained, cost), gained, trial, channels))
-        if channels < len(solved.gain):
-            cost = numbers(*[f.shape[1] for f in factors], channels + 1) - held
-            if held + cost <= budget:
+            if step.factor is None:
                 gained = solved.gain[channels]
-                steps.append((_score(error, gained, cost), gained, factors, channels + 1))
-        _, gained, wider, wider_channels = max(steps, key=lambda step: step[0], default=(0.0, 0.0, factors, channels))
-        if gained < LEAST_GAIN * error:
+            else:
+                gained = fit.added_gain(solved, factors, step.mode, step.factor)[:channels].sum()
+            if gained >= LEAST_GAIN * error:
+                cost = numbers(*(f.shape[1] for f in trial[0]), trial[1]) - held
+                steps.append((_score(error, gained, cost), step))
+        if not steps:
             break
-        factors, channels = fit.sweep(wider, wider_channels)[0], wider_channels
+        steps.sort(key=lambda pair: -pair[0])
+        for score, step in steps:
+            trial = step.taken(factors, channels)
+            if score >= ALIKE * steps[0][0] and fits(*trial):
+                factors, channels = trial
+        factors, _ = fit.sweep(factors, channels)
     factors = _settle(fit, factors, channels)
     settled = Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2])).value[..., :channels])
     return found if enough and not is_enough(settled) else settled  # settled for all, not for the worst
+
+
+class _Step(NamedTuple):
+    """One rank or one channel more."""
+
+    mode: int = -1
+    factor: np.ndarray | None = None  # of the mode, its new column last; None: a channel
+
+    def taken(self, factors, channels: int) -> tuple[list[np.ndarray], int]:
+        """Return factors and channels after it."""
+        if self.factor is None:
+            return list(factors), channels + 1
+        return [self.factor if k == self.mode else f for k, f in enumerate(factors)], channels
+
+
+def _steps(fit: TensorFit, found: Factors, most_channels: int) -> list[_Step]:
+    """Return the steps that there are."""
+    wide = fit.widened(found[:3], found.core)
+    steps = [_Step(mode, factor) for mode, factor in enumerate(wide) if factor is not None]
+    return steps if found.core.shape[3] == most_channels else [*steps, _Step()]
 
 
 def _settle(fit: TensorFit, factors, channels: int) -> list[np.ndarray]:
