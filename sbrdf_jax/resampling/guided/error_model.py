@@ -20,6 +20,8 @@ OUTLIER = 5.0  # residuals so many times the local scale begin to lose weight
 MAX_FACTOR = 4.0  # largest noise variance of an outlier, relative; clusters of drop-outs keep some say
 SAMPLES_OF_SPECTRUM = 8
 COVERED = 0.6827
+SORTED_TOGETHER = 256  # residuals whose weights are summed before the sum is looked into
+NO_WEIGHT = 1e-9
 TABLE_WIDTH = 0.6  # nodes of the table over which residuals are pooled
 
 
@@ -114,12 +116,17 @@ def fit_residual_scale(
     features, size = (np.clip(features[order], start, stop) - start) / step, size[order]
     near = [np.exp(-0.5 * ((features[:, k, None] - np.arange(shape[k])) / TABLE_WIDTH) ** 2) for k in range(3)]
     table = np.empty(shape)
-    for i, j in np.ndindex(shape[:2]):
-        # far from all samples: the nearest ones decide
-        cumulative = np.cumsum((near[0][:, i] * near[1][:, j])[:, None] * near[2] + 1e-9, axis=0)
-        for k in range(shape[2]):
-            place = np.searchsorted(cumulative[:, k], COVERED * cumulative[-1, k])
-            table[i, j, k] = size[min(place, len(size) - 1)]
+    plane = (near[0][:, :, None] * near[1][:, None, :]).reshape(len(size), -1)
+    parts = [slice(first, first + SORTED_TOGETHER) for first in range(0, len(size), SORTED_TOGETHER)]
+    # far from all samples: the nearest ones decide
+    weight = np.stack([plane[part].T @ near[2][part] + NO_WEIGHT * len(size[part]) for part in parts])
+    before = np.cumsum(weight.reshape(len(parts), *shape), axis=0)
+    for i, j, k in np.ndindex(shape):
+        wanted = COVERED * before[-1, i, j, k]
+        part = min(int(np.searchsorted(before[:, i, j, k], wanted)), len(parts) - 1)
+        own = np.cumsum(plane[parts[part], i * shape[1] + j] * near[2][parts[part], k] + NO_WEIGHT)
+        missing = wanted - (before[part - 1, i, j, k] if part else 0.0)
+        table[i, j, k] = size[parts[part]][min(int(np.searchsorted(own, missing)), len(own) - 1)]
     return ResidualScale(log_scale=np.log(np.maximum(table, 1e-6)), start=start, step=step)
 
 
