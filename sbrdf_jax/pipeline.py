@@ -161,6 +161,7 @@ def process(
             "predicted": {name: {"seconds": pair[0], "mebibytes": pair[1]} for name, pair in ready.cost.items()},
             "represent": searched,
             "coefficients_used": used,
+            "wavelengths_met_at_start": met_at_start(gridded),
             "scene": describe_needs(needs, raw.wavelength_nm, gridded),
         },
         timing=timing,
@@ -168,6 +169,11 @@ def process(
         source_sha256=raw.source_sha256,
         quadrature=ready.quadrature,
     )
+
+
+def met_at_start(gridded: GriddedBRDF) -> int:
+    """Count the wavelengths whose start was within the tolerance: they took no step."""
+    return int(np.sum((np.asarray(gridded.num_steps) == 0) & (np.asarray(gridded.status) == int(Status.OK))))
 
 
 def storage_scores(compact, rounding: np.ndarray, gridded: GriddedBRDF) -> dict[str, np.ndarray]:

@@ -229,6 +229,8 @@ def test_a_result_keeps_its_scene_and_reads_back(folder, samples):
     assert some.gridded.needed is None and some.gridded.brdf.shape[-1] == 3
     mask = some.plan["scene"]["wavelength_needed"]
     np.testing.assert_array_equal(np.flatnonzero(mask), [1, 4, 7])
+    steps = np.asarray(whole.gridded.num_steps)
+    assert whole.plan["wavelengths_met_at_start"] == np.count_nonzero(steps == 0)
     np.testing.assert_allclose(
         some.gridded.brdf, whole.gridded.brdf[..., [1, 4, 7]], rtol=0, atol=1e-9 * whole.gridded.brdf.max()
     )
