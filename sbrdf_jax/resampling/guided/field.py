@@ -48,8 +48,9 @@ class WholeSpectrum:
     wavelength_nm: Any  # [measured]
     log_amplitude: Any  # [4, measured]
     model_residual: Any  # [measured]
-    to_component: Any  # [measured, component] projection of the spectra, none where they are left as they are
-    from_component: Any  # [component, measured]
+    # projection of the spectra; no component where they are left as they are, as in results of earlier versions
+    to_component: Any = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))  # [measured, component]
+    from_component: Any = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))  # [component, measured]
 
 
 @pytree()
