@@ -118,7 +118,7 @@ def evaluate_directions(
         for k, (x, axis) in enumerate(zip(places, axes, strict=True)):
             first, weight = cubic_weights(x, axis)
             shape = (-1, *(4 if k == j else 1 for j in range(3)))
-            index = index * nodes.shape[k] + (first[:, None] + np.arange(4)).reshape(shape)
+            index = index * np.int32(nodes.shape[k]) + (first[:, None] + np.arange(4, dtype=np.int32)).reshape(shape)
             product = product * weight.reshape(shape)
         start = np.arange(0, product.size + 1, 4**3)
         rows = scipy.sparse.csr_array((product.ravel(), index.ravel(), start), (len(theta_i), np.prod(nodes.shape[:3])))
@@ -233,7 +233,8 @@ def _log_value_on_axes(field: GuidedField, theta_i, theta_o, phi_o) -> tuple[Coo
     for name, (axis, axis_i, axis_o) in GRIDS.items():
         xp, nodes = array_module(z), getattr(field, name)
         first, weight = cubic_weights(at.theta_i[0, :1], axis_i)
-        nodes = sum(weight[0, k] * xp.take(nodes, first[0] + np.int32(k), axis=1) for k in range(4))
+        around = nodes[:, first[0] : first[0] + 4] if xp is np else jax.lax.dynamic_slice_in_dim(nodes, first[0], 4, 1)
+        nodes = (weight[0] @ around.reshape(len(around), 4, -1)).reshape(len(around), *nodes.shape[2:])
         nodes = cubic_matrix(at.theta_o[:, 0], axis_o)[None] @ nodes  # [first node, o, wavelength]
         z = z + cubic_matrix(getattr(at, name), axis) @ xp.swapaxes(nodes, 0, 1)
     return at, z
