@@ -113,14 +113,12 @@ def evaluate_directions(
     at = guided_coordinates(theta_i, theta_o, phi_o, field.theta_limit)
     z = lobe_log_value(field.lobe, at, field.floor)
     for name, axes in GRIDS.items():
-        nodes, index, product = getattr(field, name), 0, 1.0
-        places = getattr(at, name), at.theta_i, at.theta_o
-        for k, (x, axis) in enumerate(zip(places, axes, strict=True)):
-            first, weight = cubic_weights(x, axis)
-            shape = (-1, *(4 if k == j else 1 for j in range(3)))
-            index = index * np.int32(nodes.shape[k]) + (first[:, None] + np.arange(4, dtype=np.int32)).reshape(shape)
-            product = product * weight.reshape(shape)
-        start = np.arange(0, product.size + 1, 4**3)
+        nodes, places = getattr(field, name), (getattr(at, name), at.theta_i, at.theta_o)
+        first, (over, over_i, over_o) = zip(*map(cubic_weights, places, axes), strict=True)
+        around = np.ravel_multi_index(tuple(np.indices((4, 4, 4)).reshape(3, -1)), nodes.shape[:3])
+        index = (np.ravel_multi_index(first, nodes.shape[:3])[:, None] + around).astype(np.int32)
+        product = over[:, :, None] * (over_i[:, :, None] * over_o[:, None, :]).reshape(-1, 1, 4**2)
+        start = np.arange(0, product.size + 1, 4**3, dtype=np.int32)
         rows = scipy.sparse.csr_array((product.ravel(), index.ravel(), start), (len(theta_i), np.prod(nodes.shape[:3])))
         z = z + rows @ nodes.reshape(-1, nodes.shape[3])
     return from_log(z, log_scale(at, field.floor))
