@@ -200,9 +200,9 @@ def error_between(compact: CompactBRDF | LobeHarmonics | LobeTensor, gridded: Gr
     def at(theta_i, cells):
         errors, counts = np.full(len(cells), np.nan), cells.any(axis=(1, 2))
         given = theta_i[counts], theta_o, phi_o, cells[counts]
-        pairs = zip(slices(gridded, *given), slices(compact, *given), strict=True)
-        sums = [(((got - want[:, live]) ** 2).sum(), (want[:, live] ** 2).sum()) for want, got in pairs]
-        errors[counts] = [relative_error(*pair) for pair in sums]
+        wanted = (value[:, live] for value in slices(gridded, *given))
+        pairs = zip(wanted, slices(compact, *given), strict=True)
+        errors[counts] = [relative_error(((got - want) ** 2).sum(), (want**2).sum()) for want, got in pairs]
         return errors
 
     both = cell[:-1] & cell[1:] if gridded.interpolate_theta_i else np.zeros_like(cell[:-1])

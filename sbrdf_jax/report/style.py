@@ -110,8 +110,8 @@ def hemisphere_axes(axes: Any, theta_i: float) -> None:
     axes.set_ylim(-97, 97)
     axes.set_axis_off()
     for radius in (30, 60):
-        axes.add_patch(Circle((0, 0), radius, fill=False, edgecolor=MUTED, linewidth=0.5, linestyle=(0, (2, 3))))
-    axes.add_patch(Circle((0, 0), 90, fill=False, edgecolor=MUTED, linewidth=0.8))
+        axes.add_artist(Circle((0, 0), radius, fill=False, edgecolor=MUTED, linewidth=0.5, linestyle=(0, (2, 3))))
+    axes.add_artist(Circle((0, 0), 90, fill=False, edgecolor=MUTED, linewidth=0.8))
     angle = np.degrees(theta_i)
     axes.plot([-angle], [0], marker="o", markersize=4.5, markerfacecolor=PAPER, markeredgecolor=INK, linewidth=0)
     if angle > 0:
