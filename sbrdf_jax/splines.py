@@ -37,4 +37,4 @@ def spline_weights(position, count: int):
         rising, falling = (np.asarray(a, dtype).reshape(shape) for a in (slope[:-1], slope[1:]))
         start, end = (np.asarray(a, dtype).reshape(shape) for a in (knots[: -k - 1], knots[k + 1 :]))
         weight = (x - start) * rising * weight[:-1] + (end - x) * falling * weight[1:]
-    return xp.moveaxis(weight, 0, -1)
+    return xp.moveaxis(weight, 0, -1).copy()  # in NumPy's usual order, which decides how products with it round

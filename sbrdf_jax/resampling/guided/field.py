@@ -232,7 +232,7 @@ def _log_value_on_axes(field: GuidedField, theta_i, theta_o, phi_o) -> tuple[Coo
         xp, nodes = array_module(z), getattr(field, name)
         first, weight = cubic_weights(at.theta_i[0, :1], axis_i)
         around = nodes[:, first[0] : first[0] + 4] if xp is np else jax.lax.dynamic_slice_in_dim(nodes, first[0], 4, 1)
-        nodes = (weight[0] @ around.reshape(len(around), 4, -1)).reshape(len(around), *nodes.shape[2:])
+        nodes = sum(weight[0, k] * around[:, k] for k in range(4))
         nodes = cubic_matrix(at.theta_o[:, 0], axis_o)[None] @ nodes  # [first node, o, wavelength]
         z = z + cubic_matrix(getattr(at, name), axis) @ xp.swapaxes(nodes, 0, 1)
     return at, z
