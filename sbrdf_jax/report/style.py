@@ -24,7 +24,7 @@ _RC: Any = {
     "axes.titlesize": 11.5,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
-    "axes.titley": 1.0,  # where it is anyway, as nothing has ticks on top: else every axis is laid out once more
+    "axes.titley": 1.0,  # fixed: nothing has ticks on top, and to look for them every axis is laid out once more
     "axes.labelsize": 10.5,
     "axes.edgecolor": MUTED,
     "axes.labelcolor": INK,
@@ -70,6 +70,9 @@ def save_figure(figure: Any, path: Path) -> Path:
     """Write a figure as PNG and return its path; the same figure gives the same bytes."""
     for axes in figure.axes:
         _thin_out(axes)
+        factor = axes.yaxis.get_offset_text()  # of all ticks, where they have one: left of the title, not under it
+        if factor.get_horizontalalignment() == "left":
+            factor.set(horizontalalignment="right", x=-0.02)
     figure.get_layout_engine().execute(figure)
     figure.set_layout_engine("none")
     with whole_file(path) as temporary:  # savefig would lay out and draw everything twice
