@@ -81,17 +81,18 @@ def save_figure(figure: Any, path: Path) -> Path:
 
 
 def _thin_out(axes: Any) -> None:
-    """Leave out the minor ticks of a logarithmic axis of many decades: they say nothing, and take half of the time.
+    """Leave out the minor ticks of logarithmic axes of many decades: they say nothing, and take half of the time.
 
-    Its decades are written without mathtext, which takes ten times as long as text.
+    Their decades are written without mathtext, which takes ten times as long as text.
     """
     from matplotlib.ticker import LogFormatterMathtext, NullLocator
 
-    low, high = axes.get_ylim()
-    if axes.get_yscale() == "log" and high > MANY_DECADES * low:
-        axes.yaxis.set_minor_locator(NullLocator())
-        if isinstance(axes.yaxis.get_major_formatter(), LogFormatterMathtext):
-            axes.yaxis.set_major_formatter(_decade)
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        if axis.get_scale() == "log" and high > MANY_DECADES * low:
+            axis.set_minor_locator(NullLocator())
+            if isinstance(axis.get_major_formatter(), LogFormatterMathtext):
+                axis.set_major_formatter(_decade)
 
 
 def _decade(value: float, _position: int) -> str:
