@@ -97,6 +97,7 @@ def hemisphere_modes(theta: np.ndarray, phi: np.ndarray) -> Iterator[np.ndarray]
     cosine, sine = np.cos(theta), np.sin(theta)
     last: list[np.ndarray] = []  # of degree l - 1, by order m
     before: list[np.ndarray] = []  # of degree l - 2
+    waves: list[np.ndarray] = []  # cos(m phi), by order m
     degree = 0
     while True:
         now = []
@@ -111,8 +112,8 @@ def hemisphere_modes(theta: np.ndarray, phi: np.ndarray) -> Iterator[np.ndarray]
                 scale = np.sqrt((4 * degree**2 - 1) / (degree**2 - order**2))
                 back = np.sqrt(((degree - 1) ** 2 - order**2) / (4 * (degree - 1) ** 2 - 1))
                 now.append(scale * (cosine * last[order] - back * before[order]))
-        orders = range(degree % 2, degree + 1, 2)
-        yield np.stack([now[order] * np.cos(order * phi) for order in orders], axis=-1)
+        waves.append(np.cos(degree * phi))
+        yield np.stack([now[order] * waves[order] for order in range(degree % 2, degree + 1, 2)]).T
         last, before = now, last
         degree += 1
 
@@ -128,19 +129,21 @@ def sequential_bases(theta: np.ndarray, phi: np.ndarray, *, max_degree: int) -> 
     """
     allowed = SHARE_OF_SAMPLES * len(theta)
     bases: list[np.ndarray] = []
-    found = np.zeros((len(theta), 0))
+    every, count = np.empty((len(theta), sum(degree // 2 + 1 for degree in range(max_degree + 1))), order="F"), 0
     for degree, modes in enumerate(hemisphere_modes(theta, phi)):
         if degree > max_degree:
             break
         modes = modes / np.maximum(np.linalg.norm(modes, axis=0), 1e-300)
+        found = every[:, :count]
         for _ in range(2):  # once leaves rounding of the size of the condition number
             modes = modes - found @ (found.T @ modes)
         left, singular, _ = np.linalg.svd(modes, full_matrices=False)
         new = left[:, singular > 1e-7]
-        if degree > 0 and found.shape[1] + new.shape[1] > allowed:
+        if degree > 0 and count + new.shape[1] > allowed:
             break
         bases.append(new)
-        found = np.concatenate([found, new], axis=1)
+        every[:, count : count + new.shape[1]] = new
+        count += new.shape[1]
     return bases
 
 
@@ -225,8 +228,9 @@ def measure_cutoff(
         subset = group[:: -(-len(group) // MAX_SAMPLES)]
         max_degree = min(int(np.ceil(1.25 * cutoff)), MAX_DEGREE)
         bases = sequential_bases(theta_o[subset], phi_o[subset], max_degree=max_degree)
-        energy = np.mean(np.sum(value[subset] ** 2, axis=0))
-        explained = np.array([np.mean(np.sum((basis.T @ value[subset]) ** 2, axis=0)) for basis in bases])
+        chosen = value[subset]
+        energy = np.mean(np.sum(chosen**2, axis=0))
+        explained = np.array([np.mean(np.sum((basis.T @ chosen) ** 2, axis=0)) for basis in bases])
         num_modes = np.array([basis.shape[1] for basis in bases])
         per_mode = len(subset) / np.maximum(num_modes, 1) / energy
         residual_power = None

@@ -200,9 +200,9 @@ def error_between(compact: CompactBRDF | LobeHarmonics | LobeTensor, gridded: Gr
     def at(theta_i, cells):
         errors, counts = np.full(len(cells), np.nan), cells.any(axis=(1, 2))
         given = theta_i[counts], theta_o, phi_o, cells[counts]
-        pairs = zip(slices(gridded, *given), slices(compact, *given), strict=True)
-        sums = [(((got - want[:, live]) ** 2).sum(), (want[:, live] ** 2).sum()) for want, got in pairs]
-        errors[counts] = [relative_error(*pair) for pair in sums]
+        wanted = (value[:, live] for value in slices(gridded, *given))
+        pairs = zip(wanted, slices(compact, *given), strict=True)
+        errors[counts] = [relative_error(((got - want) ** 2).sum(), (want**2).sum()) for want, got in pairs]
         return errors
 
     both = cell[:-1] & cell[1:] if gridded.interpolate_theta_i else np.zeros_like(cell[:-1])
@@ -317,8 +317,9 @@ def off_node_scores(
     first, last = np.asarray(result.theta_i)[[0, -1]]
     known = (theta_o >= first) & (theta_o <= last)
     live = np.isfinite(forward) & np.isfinite(backward) & known[:, None]
-    energy = (forward[live] ** 2 + backward[live] ** 2).sum() / 2
-    return share, depth, float(relative_error(((forward[live] - backward[live]) ** 2).sum(), energy))
+    forward, backward = forward[live], backward[live]
+    energy = (forward**2 + backward**2).sum() / 2
+    return share, depth, float(relative_error(((forward - backward) ** 2).sum(), energy))
 
 
 def _near_needed(nodes_i, needed, theta_i, theta_o, phi_o) -> Bool[np.ndarray, " direction"]:
@@ -354,7 +355,10 @@ def albedo(result, whole: Bool[np.ndarray, " theta_i"] | None = None) -> Float[n
     point, weight = np.polynomial.legendre.leggauss(num_theta)
     theta_o = (point + 1) * np.pi / 4
     weight = weight * np.pi / 4 * np.cos(theta_o) * np.sin(theta_o)
-    phi_o = (np.arange(num_phi) + 0.5) * (2 * np.pi / num_phi)
+    step = 2 * np.pi / num_phi
+    if _is_symmetric(result):  # one side of the plane of incidence stands for both
+        num_phi, weight = num_phi // 2, 2 * weight
+    phi_o = (np.arange(num_phi) + 0.5) * step
     nodes = np.asarray(result.theta_i)
     rows = np.full((len(nodes), np.size(measured_wavelengths(result))), np.nan)
     whole = np.ones(len(nodes), bool) if whole is None else whole
@@ -362,7 +366,7 @@ def albedo(result, whole: Bool[np.ndarray, " theta_i"] | None = None) -> Float[n
     values = slices(result, nodes[whole], theta_o, phi_o, every)
     for i, value in zip(np.flatnonzero(whole), values, strict=True):
         rows[i] = weight @ value.reshape(num_theta, num_phi, -1).sum(axis=1)
-    return rows * (2 * np.pi / num_phi)
+    return rows * step
 
 
 def albedo_warnings(albedo: np.ndarray, result, stage: str) -> list[str]:
@@ -395,14 +399,13 @@ def slices(
         _, first, back = np.unique(np.round(fold_azimuth(phi_o), 12), return_index=True, return_inverse=True)
         phi_o, back = phi_o[first], back.reshape(-1)
     distinct = np.stack([where[..., back == k].any(axis=-1) for k in range(len(phi_o))], axis=-1)
-    num_wavelengths = np.size(measured_wavelengths(result))
-    step = max(1, MOST_NUMBERS // (len(theta_o) * len(phi_o) * num_wavelengths))
+    step = max(1, MOST_NUMBERS // (len(theta_o) * len(phi_o) * np.size(measured_wavelengths(result))))
     for start in range(0, len(theta_i), step):
         part = distinct[start : start + step]
-        value = np.empty((*part.shape, num_wavelengths))
-        value[part] = evaluate_where(result, theta_i[start : start + step], theta_o, phi_o, part, chunk_size=CHUNK_SIZE)
-        for each, mask in zip(value, where[start : start + step], strict=True):
-            yield each[:, back][mask]
+        value = evaluate_where(result, theta_i[start : start + step], theta_o, phi_o, part, chunk_size=CHUNK_SIZE)
+        place = np.cumsum(part).reshape(part.shape) - 1  # of each direction that is evaluated, among them
+        for each, mask in zip(place, where[start : start + step], strict=True):
+            yield value[each[:, back][mask]]
 
 
 def _is_symmetric(result) -> bool:

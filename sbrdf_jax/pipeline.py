@@ -11,6 +11,7 @@ from sbrdf_jax.compact_layout import stored_bytes
 from sbrdf_jax.encoding import coefficients_allowed, data_basis, encode_field, make_basis
 from sbrdf_jax.folds import LEAVE_ONE_OUT, Folds, make_folds
 from sbrdf_jax.grid import Grid, has_data, make_grid
+from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.metrics import live_wavelengths, measure, needed_nodes, on_rows
 from sbrdf_jax.needs import Needs, restrict_theta_i
 from sbrdf_jax.options import EncodeOptions, RunOptions
@@ -132,7 +133,7 @@ def process(
         missed, rounding = tuple(searched.pop("warnings", ())), searched.pop("storage_error")
         progress.update(count_statuses(compact.status))
 
-    with _timed(progress, timing, "measure"):
+    with _timed(progress, timing, "measure"), one_blas_thread():
         metrics = measure(gridded, field, compact, absolute=raw.quantity == "brdf", matching=matching)
         metrics.value.update(storage_scores(compact, rounding, gridded))
 

@@ -10,8 +10,9 @@ DEGREE = 3
 def spline_weights(position, count: int):
     """Return the values of all B-splines of a clamped, uniform knot vector on [0, 1].
 
-    De Boor's recursion over all functions at once: they are few. The weights are not negative
-    and sum to 1; the first and the last function are 1 at the ends.
+    De Boor's recursion over all functions at once: they are few, and on the first axis until the end, so that
+    NumPy runs along the places. The weights are not negative and sum to 1; the first and the last function are 1
+    at the ends.
 
     Args:
         position: Where [...], 0 to 1; what lies beyond is clamped.
@@ -22,8 +23,8 @@ def spline_weights(position, count: int):
     """
     xp, degree = array_module(position), min(DEGREE, count - 1)
     knots = np.concatenate([np.zeros(degree), np.linspace(0, 1, count - degree + 1), np.ones(degree)])
-    x = xp.clip(position, 0.0, 1.0)[..., None]
-    shape = (1,) * (x.ndim - 1) + (-1,)
+    x = xp.clip(position, 0.0, 1.0)[None]
+    shape = (-1,) + (1,) * (x.ndim - 1)
     lower, upper = knots[:-1].copy(), knots[1:].copy()
     upper[count - 1] = 2.0  # the last interval holds its end; those after it are empty
     inside = (knots[1:] > knots[:-1]).reshape(shape)
@@ -35,5 +36,5 @@ def spline_weights(position, count: int):
         slope = np.divide(1.0, width, out=np.zeros_like(width), where=width > 0)
         rising, falling = (np.asarray(a, dtype).reshape(shape) for a in (slope[:-1], slope[1:]))
         start, end = (np.asarray(a, dtype).reshape(shape) for a in (knots[: -k - 1], knots[k + 1 :]))
-        weight = (x - start) * rising * weight[..., :-1] + (end - x) * falling * weight[..., 1:]
-    return weight
+        weight = (x - start) * rising * weight[:-1] + (end - x) * falling * weight[1:]
+    return xp.moveaxis(weight, 0, -1).copy()  # in NumPy's usual order, which decides how products with it round

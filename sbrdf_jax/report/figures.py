@@ -10,6 +10,7 @@ import numpy as np
 from sbrdf_jax.config import parse_config
 from sbrdf_jax.cutoff import CutoffSpectrum, cutoff_warnings, measure_cutoff
 from sbrdf_jax.evaluation import evaluate_in_chunks
+from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, RawSamples, SpectralField
 from sbrdf_jax.report import curves, hemisphere, quality
 from sbrdf_jax.report.fine_grid import finite_wavelengths, interpolate_finely, pick_incidences, ring_effect
@@ -57,7 +58,7 @@ def draw_figures(result: RunResult, folder: Path, samples: RawSamples | None = N
 def draw(result: RunResult, folder: Path, samples: RawSamples | None = None, *, prefix: str = "") -> list[Drawing]:
     """Draw as `draw_figures` does, and return each figure with its title and caption."""
     drawings = []
-    with style_context():
+    with style_context(), one_blas_thread():
         for sketch in _sketches(result, samples):
             path = save_figure(sketch.figure, Path(folder) / f"{prefix}{sketch.name}.png")
             drawings.append(Drawing(path, sketch.title, sketch.caption, sketch.warnings))

@@ -114,10 +114,12 @@ def _evaluate_finely(
     gridded: GriddedBRDF, incidences: list[Picked], wavelength: Picked, solved: np.ndarray, num: int = 91
 ) -> FineGrid:
     theta_o, phi_o = np.linspace(0, np.pi / 2, num), np.linspace(0, 2 * np.pi, num)
-    value = evaluate_on_axes(gridded, np.array([p.value for p in incidences]), theta_o, phi_o)
+    half = phi_o[: (num + 1) // 2]  # a field is the same on both sides of the plane of incidence
+    value = evaluate_on_axes(gridded, np.array([p.value for p in incidences]), theta_o, half)
     matching = colour.colour_matching(np.asarray(gridded.wavelength_nm)[solved])
     linear = colour.brdf_to_srgb(value[..., solved], matching, gamma=False)
     channels = np.concatenate([value[..., wavelength.index, None], linear], axis=-1)
+    channels = np.concatenate([channels, channels[:, :, -2::-1]], axis=2)
     return FineGrid(incidences, theta_o, phi_o, wavelength, channels, channels)
 
 

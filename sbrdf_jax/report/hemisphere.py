@@ -1,5 +1,6 @@
 """The hemisphere seen from above: colour maps (figures 8 and 9), where the data are, where they are not."""
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ PIXELS = 361
 COVERAGE = (("measured nearby", BLUE), ("interpolated", SKY), ("beyond the measured range", ORANGE))
 
 
+@functools.cache
 def pixel_directions(pixels: int) -> tuple[np.ndarray, np.ndarray]:
     """Radius (1 at the rim, theta_o = 90 degrees) and azimuth phi_o [rad] of the pixels of a square picture.
 
@@ -31,11 +33,15 @@ def disk_image(
     row = np.minimum(radius, 1.0) * (value.shape[0] - 1)
     column = azimuth / (2 * np.pi) * (value.shape[1] - 1)
     i, j = np.minimum(row.astype(int), value.shape[0] - 2), np.minimum(column.astype(int), value.shape[1] - 2)
-    s, t = (row - i)[..., None], (column - j)[..., None]
-    image = (1 - s) * ((1 - t) * value[i, j] + t * value[i, j + 1])
-    image += s * ((1 - t) * value[i + 1, j] + t * value[i + 1, j + 1])
-    image[radius > 1] = np.nan
-    return image
+    s, t, width = row - i, column - j, value.shape[1]
+    flat = np.moveaxis(value, -1, 0).reshape(value.shape[2], -1)  # channel by channel NumPy runs along the pixels
+    before, after = (
+        (1 - t) * flat.take(first, axis=1) + t * flat.take(first + 1, axis=1)
+        for first in (i * width + j, (i + 1) * width + j)
+    )
+    image = (1 - s) * before + s * after
+    image[:, radius > 1] = np.nan
+    return np.moveaxis(image, 0, -1)
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:

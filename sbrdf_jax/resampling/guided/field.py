@@ -114,14 +114,12 @@ def evaluate_directions(
     at = guided_coordinates(theta_i, theta_o, phi_o, field.theta_limit)
     z = lobe_log_value(field.lobe, at, field.floor)
     for name, axes in GRIDS.items():
-        nodes, index, product = getattr(field, name), 0, 1.0
-        places = getattr(at, name), at.theta_i, at.theta_o
-        for k, (x, axis) in enumerate(zip(places, axes, strict=True)):
-            first, weight = cubic_weights(x, axis)
-            shape = (-1, *(4 if k == j else 1 for j in range(3)))
-            index = index * nodes.shape[k] + (first[:, None] + np.arange(4)).reshape(shape)
-            product = product * weight.reshape(shape)
-        start = np.arange(0, product.size + 1, 4**3)
+        nodes, places = getattr(field, name), (getattr(at, name), at.theta_i, at.theta_o)
+        first, (over, over_i, over_o) = zip(*map(cubic_weights, places, axes), strict=True)
+        around = np.ravel_multi_index(tuple(np.indices((4, 4, 4)).reshape(3, -1)), nodes.shape[:3])
+        index = (np.ravel_multi_index(first, nodes.shape[:3])[:, None] + around).astype(np.int32)
+        product = over[:, :, None] * (over_i[:, :, None] * over_o[:, None, :]).reshape(-1, 1, 4**2)
+        start = np.arange(0, product.size + 1, 4**3, dtype=np.int32)
         rows = scipy.sparse.csr_array((product.ravel(), index.ravel(), start), (len(theta_i), np.prod(nodes.shape[:3])))
         z = z + rows @ nodes.reshape(-1, nodes.shape[3])
     return from_log(z, log_scale(at, field.floor))
@@ -234,7 +232,8 @@ def _log_value_on_axes(field: GuidedField, theta_i, theta_o, phi_o) -> tuple[Coo
     for name, (axis, axis_i, axis_o) in GRIDS.items():
         xp, nodes = array_module(z), getattr(field, name)
         first, weight = cubic_weights(at.theta_i[0, :1], axis_i)
-        nodes = sum(weight[0, k] * xp.take(nodes, first[0] + np.int32(k), axis=1) for k in range(4))
+        around = nodes[:, first[0] : first[0] + 4] if xp is np else jax.lax.dynamic_slice_in_dim(nodes, first[0], 4, 1)
+        nodes = sum(weight[0, k] * around[:, k] for k in range(4))
         nodes = cubic_matrix(at.theta_o[:, 0], axis_o)[None] @ nodes  # [first node, o, wavelength]
         z = z + cubic_matrix(getattr(at, name), axis) @ xp.swapaxes(nodes, 0, 1)
     return at, z

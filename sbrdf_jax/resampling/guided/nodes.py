@@ -128,9 +128,12 @@ def cubic_weights(
 def cubic_matrix(x: Float[AnyArray, "*shape"], axis: Axis) -> Float[AnyArray, "*shape node"]:
     """`cubic_weights` as rows over all nodes, the mirrored ones included; for products with a few rows of nodes."""
     first, weight = cubic_weights(x, axis)
+    if array_module(x) is np:
+        rows = np.zeros((*x.shape, axis.count + 2))
+        np.put_along_axis(rows, _four(first), weight, axis=-1)
+        return rows
     nodes = np.arange(axis.count + 2, dtype=np.int32).reshape((1,) * (x.ndim + 1) + (-1,))
-    is_node = _four(first)[..., None] == nodes
-    return array_module(x).where(is_node, weight[..., None], 0.0).sum(axis=-2)
+    return jnp.where(_four(first)[..., None] == nodes, weight[..., None], 0.0).sum(axis=-2)
 
 
 def _four(first: Int[AnyArray, "*shape"]) -> Int[AnyArray, "*shape 4"]:

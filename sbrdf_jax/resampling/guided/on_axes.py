@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-MOST_AT_A_TIME = 2048  # directions; more leave the processor's cache
+MOST_AT_A_TIME = 2304  # directions, 48 x 48 of the albedo's quadrature; more leave the processor's cache
 
 
 def on_axes(
