@@ -36,7 +36,7 @@ def grow(
 
     def fits(factors, channels: int) -> bool:
         ranks = [f.shape[1] for f in factors]
-        return np.prod(ranks) <= MOST_CELLS and numbers(*ranks, channels) <= budget
+        return bool(np.prod(ranks) <= MOST_CELLS and numbers(*ranks, channels) <= budget)
 
     while True:
         solved = fit.solve_core(*factors[:2], fit.project(factors[2]))
