@@ -5,6 +5,7 @@ but some lanes failed, 130 interrupted, 143 terminated.
 """
 
 import argparse
+import gc
 import importlib
 import os
 import sys
@@ -25,6 +26,7 @@ COMMANDS = {
     "footprint": "which directions of its materials a scene looks at",
     "schema": "JSON schema of the config, for editors",
 }
+OBJECTS_A_COLLECTION = 200_000  # modules are most of a process's objects, and live: to look through them costs 0.4 s
 STOPPED_BATCH = "finished results stay; the same command goes on from there"
 
 
@@ -70,6 +72,7 @@ def main(argv: Sequence[str]) -> int:
 
 def main_exit(*verb: str) -> None:
     """Run the process's own command line, after `verb` where the module names it, and end the process."""
+    gc.set_threshold(OBJECTS_A_COLLECTION)
     argv = [*verb, *sys.argv[1:]]
     remarks = {"remark": STOPPED_BATCH} if argv[:1] == ["batch"] else {}
     stop_on_signals(" ".join(["sbrdf", *argv[:1]]), **remarks)
