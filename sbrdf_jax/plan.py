@@ -126,14 +126,14 @@ def predict_cost(kept: RawSamples, grid: Grid, options: RunOptions, needs: Needs
     cost = {}
     if options.resample.method == "guided":
         centres = min(kept.num_samples, MOST_CENTRES)
-        cost["estimate"] = (0.2 + 5e-10 * centres**3, 3 * 8 * centres**2 / MEBI)
+        cost["estimate"] = (0.2 + 3.5e-10 * centres**3, 3 * 8 * centres**2 / MEBI)
         variance = nodes * centres * (centres + FEATURES) * 2
-        seconds = 0.05 + 2 * centres**2 * lanes * 60 / RATE + variance / RATE + cell_lanes * 4e-7
+        seconds = 0.05 + 2 * centres**2 * lanes * 10 / RATE + variance / (2 * RATE) + cell_lanes * 4e-7
         cost["resample"] = (seconds, (8 * (2 * centres**2 + 4 * cell_lanes)) / MEBI)
     else:
         unknowns = grid.num_unknowns
         inverse = unknowns if unknowns <= MAX_UNKNOWNS else 0
         cost["resample"] = (0.5 * inverse**3 / RATE + unknowns**2 * lanes * 40 / RATE, 16 * inverse**2 / MEBI)
-    cost["represent"] = (0.05 + 0.11 * nodes / NODES_OF_A_HEMISPHERE, 40 * cell_lanes / MEBI)
-    cost["measure"] = (0.2 + cell_lanes * 5e-6, 16 * cell_lanes / MEBI)
+    cost["represent"] = (0.05 + 0.04 * nodes / NODES_OF_A_HEMISPHERE + cell_lanes * 1.3e-6, 40 * cell_lanes / MEBI)
+    cost["measure"] = (0.3 + cell_lanes * 1.05e-6, 16 * cell_lanes / MEBI)
     return cost
