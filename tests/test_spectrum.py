@@ -3,6 +3,11 @@
 import numpy as np
 import pytest
 
+from sbrdf_jax.builtin import measure
+from sbrdf_jax.cleaning import clean
+from sbrdf_jax.options import ResampleOptions
+from sbrdf_jax.resampling.guided import fit_field
+from sbrdf_jax.resampling.guided.field import evaluate_directions
 from sbrdf_jax.resampling.guided.spectrum import spectral_filter
 
 DIRECTIONS, WAVELENGTHS, RANK, NOISE = 600, 40, 3, 0.02
@@ -74,3 +79,13 @@ def test_spectra_are_left_as_they_are(planted, case):
     found = spectral_filter(z, left_out)
     assert found.to_component.shape[1] == 0
     assert found(z) is z
+
+
+def test_highlights_have_no_noise_of_single_wavelengths():
+    raw = measure("amber_glass", count=40)  # noise of 1 % of each sample and wavelength
+    field = fit_field(clean(raw, method="guided").samples, ResampleOptions()).field
+    angle = np.deg2rad([30.0, 45.0])
+    value = evaluate_directions(field, angle, angle, np.full(2, np.pi))
+    roughness = np.diff(value, 2, axis=1).std(axis=1) / value.mean(axis=1) / np.sqrt(6)
+    print(roughness)
+    assert (roughness < 2e-3).all()

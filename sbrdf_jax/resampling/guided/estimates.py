@@ -23,7 +23,7 @@ from sbrdf_jax.resampling.guided.error_model import (
 )
 from sbrdf_jax.resampling.guided.field import GuidedField
 from sbrdf_jax.resampling.guided.inverse import leave_group_out, lower_product, mirror_lower, whitener
-from sbrdf_jax.resampling.guided.lobe_fit import density_weights, fit_lobe_model
+from sbrdf_jax.resampling.guided.lobe_fit import density_weights, fit_amplitudes, fit_lobe_model
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
 from sbrdf_jax.resampling.guided.nodes import ModeVariance
 from sbrdf_jax.resampling.guided.smoothing import choose_smoothing
@@ -95,6 +95,11 @@ def estimate(
     factor[seen] = noise_factors(half[seen], *centres.angles[:2, seen], choice.left_out[seen])
     noise = centres.noise(choice.noise) * factor
     spectra = spectral_filter((model + residual)[seen], choice.left_out[seen])
+    if spectra.to_component.size:  # the amplitudes have noise of single wavelengths too
+        filtered = spectra(model + residual)
+        value = from_log(filtered, log_scale(centres.at, floor))
+        lobe, model_residual = fit_amplitudes(lobe.shape, value, filtered, centres.at, density, floor)
+        residual, model = _split(centres, z_sample, at_samples, lobe, floor)
     residual = _filtered(spectra, residual, model)
     whiten = whitener(centres.prior(choice.variance), noise)
     lower = lower_product(whiten)

@@ -63,15 +63,29 @@ def fit_lobe_model(
     Returns:
         The model, and per wavelength the relative norm of the loss's gradient by its log amplitudes.
     """
-    scale = log_scale(at, floor)
-    lowest, highest = np.log(floor) + LOG_AMPLITUDE_RANGE
-    used = _Problem(at, np.ascontiguousarray(z.T), weight, scale, float(lowest), float(highest))
-    amplitude = used.clip(_start(value, at, weight > 0))
+    problem, amplitude = _problem(value, z, at, weight, floor)
     every = max(1, z.shape[1] // NUM_FIT_WAVELENGTHS)
     with one_blas_thread():
-        shape = _fit_shape(used._replace(z=used.z[::every]), amplitude[::every])
-        amplitude, gradient = _fit_amplitudes(used, lobe_terms(shape, at), amplitude)
+        shape = _fit_shape(problem._replace(z=problem.z[::every]), amplitude[::every])
+    return fit_amplitudes(shape, value, z, at, weight, floor)
+
+
+def fit_amplitudes(
+    shape: np.ndarray, value: np.ndarray, z: np.ndarray, at: Coordinates, weight: np.ndarray, floor: float
+) -> tuple[LobeModel, np.ndarray]:
+    """Do what `fit_lobe_model` does for a shape that is known."""
+    problem, amplitude = _problem(value, z, at, weight, floor)
+    with one_blas_thread():
+        amplitude, gradient = _fit_amplitudes(problem, lobe_terms(shape, at), amplitude)
     return LobeModel(shape, amplitude.T), gradient
+
+
+def _problem(value: np.ndarray, z: np.ndarray, at: Coordinates, weight: np.ndarray, floor: float):
+    """Return the problem of all wavelengths, and where their log amplitudes start."""
+    lowest, highest = np.log(floor) + LOG_AMPLITUDE_RANGE
+    scale = log_scale(at, floor)
+    problem = _Problem(at, np.ascontiguousarray(z.T), weight, scale, float(lowest), float(highest))
+    return problem, problem.clip(_start(value, at, weight > 0))
 
 
 def density_weights(half: np.ndarray) -> np.ndarray:
