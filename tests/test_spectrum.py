@@ -83,10 +83,9 @@ def test_spectra_are_left_as_they_are(planted, case):
 
 def test_highlights_have_no_noise_of_single_wavelengths():
     raw = measure("amber_glass")  # noise of 1 % of each sample and wavelength
-    field = fit_field(
-        clean(raw, method="guided").samples, ResampleOptions(method="guided", smoothness_weight="data", tolerance=1e-6)
-    ).field
+    options = ResampleOptions(method="guided", smoothness_weight="data", tolerance=1e-6)
+    field = fit_field(clean(raw, method="guided").samples, options).field
     angle = np.deg2rad([0.0, 45.0])
     value = evaluate_directions(field, angle, angle, np.full(2, np.pi))
     roughness = np.diff(value, 2, axis=1).std(axis=1) / value.mean(axis=1) / np.sqrt(6)
-    assert (roughness < 1e-3).all()
+    assert (roughness < 1.5e-3).all()  # 2 to 4e-3 where each wavelength has lobes of its own
