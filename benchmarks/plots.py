@@ -14,6 +14,7 @@ from benchmarks.tables import USUAL, unique
 MARKERS = "os^Dv*Pxph"
 LEAST_SPAN = 12.0  # of a logarithmic axis, highest over lowest
 DPI = 110  # many panels: below 150 kB
+TITLE_SIZE = 9.5  # problems have long names
 COLUMNS = 3  # panels side by side
 NOT_DRAWN = ("cold start",)  # three numbers
 
@@ -49,7 +50,8 @@ def draw_error_time(records: list[Record], path: Path) -> bool:
                 line = [(r.seconds_min, getattr(r, height)) for r in some if r.method == method]  # as the setting goes
                 at = zip(*line, strict=True) if line else ((), ())
                 axes.loglog(*at, **_look(methods.index(method)), label=method)
-            axes.set(title=problem, xlabel="seconds, warm")
+            axes.set(xlabel="seconds, warm")
+            axes.set_title(problem, fontsize=TITLE_SIZE)
             axes.set_ylabel("relative KKT residual" if height == "kkt_residual" else _wrapped(some[0].error_kind))
             _few_ticks(axes)
         _save(figure, panels[0], path)
@@ -105,7 +107,8 @@ def draw_roofline(records: list[Record], path: Path) -> bool:
                 for record, place in zip(steps, places, strict=True):
                     where = {"xytext": (0, -11), "textcoords": "offset points", "ha": "center"}
                     axes.annotate(record.setting.split()[0], place, **where, fontsize=8, color=MUTED)
-            axes.set(title=f"{problem}; numbers: lanes", xlabel="operations for each byte")
+            axes.set(xlabel="operations for each byte")
+            axes.set_title(f"{problem}; numbers: lanes", fontsize=TITLE_SIZE)
             axes.set_ylabel("1e9 operations a second")
         for axes in panels:
             axes.legend(fontsize=7.5, loc="lower right")
@@ -126,7 +129,10 @@ def _panels(count: int, *, columns: int, width: float = 3.7) -> tuple[Any, list[
     columns = min(columns, count)
     rows = -(-count // columns)
     figure = new_figure(max(width * columns, 6.0), 3.0 * rows + 0.9)
-    return figure, list(figure.subplots(rows, columns, squeeze=False).ravel())[:count]
+    panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
+    for unused in panels[count:]:
+        unused.remove()
+    return figure, panels[:count]
 
 
 def _look(number: int) -> dict[str, Any]:
