@@ -323,8 +323,7 @@ def evaluate_standard_error(
     if not isinstance(field, GuidedField):
         raise TypeError(f"{type(result).__name__}: its method has no standard error")
     angles = np.broadcast_arrays(*(np.asarray(a, float) for a in (theta_i, theta_o, phi_o)))
-    whiten = jnp.asarray(field_whitener(field))
-    _, *found = evaluate_with_error(evaluated_part(field), whiten, *(jnp.asarray(a.reshape(-1)) for a in angles))
+    _, *found = evaluate_with_error(evaluated_part(field), field_whitener(field), *(a.reshape(-1) for a in angles))
     both = np.asarray(found).reshape(2, *angles[0].shape, -1)
     if wavelength_nm is not None:
         measured = np.asarray(field.wavelength_nm)

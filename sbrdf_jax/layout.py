@@ -88,8 +88,8 @@ def write_guided(group: h5py.Group, field: GuidedField) -> None:
         value = arrays.pop(name)
         write_array(group, name, value, "1", chunks=(*value.shape[:-1], min(value.shape[-1], WAVELENGTHS_A_CHUNK)))
     write_mapping(group, arrays | parts | {"lobe_shape": list(SHAPE_NAMES)}, "1")
-    for name, axes in GRIDS.items():
-        for axis, label in zip(axes, (name, "theta_i", "theta_o"), strict=True):
+    for name, grid in GRIDS.items():
+        for axis, label in zip(grid.axes, grid.coordinates, strict=True):
             group[name].attrs[f"{label}_nodes"] = axis.nodes
 
 
@@ -178,12 +178,18 @@ def read_guided(group: h5py.Group, lanes: np.ndarray | slice = _EVERY) -> Guided
     stored = read_mapping(group, without=LAST_AXIS)
     count = len(dataset_of(group, "wavelength_nm"))
     for name in LAST_AXIS:
+        if name == "difference" and name not in group:  # written before there was this grid
+            shape = [axis.count for axis in GRIDS[name].axes]
+            stored[name] = np.zeros((*shape, len(np.arange(count)[lanes])))
+            continue
         stored[name] = read(group, name, (*dataset_of(group, name).shape[:-1], count), last=lanes)
+    stored["lobe"].setdefault("mirror_power", 2.0)  # written before it was stored
     stored["lobe"]["log_amplitude"] = stored["lobe"]["log_amplitude"][:, lanes]
     parts = {name: kind(**stored.pop(name)) for name, kind in GUIDED_PARTS.items()}
     angles = {name: np.deg2rad(stored.pop(f"{name}_deg")) for name in ("theta_limit", "centre")}
-    variance = parts["variance"]
+    variance, lobe = parts["variance"], parts["lobe"]
     parts["variance"] = dataclasses.replace(variance, reciprocal=bool(variance.reciprocal))
+    parts["lobe"] = dataclasses.replace(lobe, mirror_power=float(lobe.mirror_power))
     names = {f.name for f in dataclasses.fields(GuidedField)}
     plain = {name: np.asarray(value) for name, value in stored.items() if name in names}
     nodes = {name: mirror(plain.pop(name)) for name in GRIDS}

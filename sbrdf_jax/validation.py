@@ -8,7 +8,6 @@ whole measurement. Any method is validated in the same way, through `predict`.
 import dataclasses
 from collections.abc import Callable, Mapping
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -72,8 +71,7 @@ def predict(
     angles = theta_i, theta_o, phi_o
     if options.method == "guided":
         fit = fit_field(train, options, report, None if centres is None else centres.take(train.row))
-        field, whiten = evaluated_part(fit.field), jnp.asarray(fit.whiten)
-        value, error, noise = evaluate_with_error(field, whiten, *map(jnp.asarray, angles))
+        value, error, noise = evaluate_with_error(evaluated_part(fit.field), fit.whiten, *angles)
         return Prediction(np.asarray(value), fit.status, np.hypot(error, noise))
     gridded = resample(train, grid, options, report)
     return Prediction(evaluate_in_chunks(gridded, *angles), np.asarray(gridded.status, int))

@@ -43,6 +43,8 @@ from sbrdf_jax.resampling.guided.covariance import (
     prior_variance,
 )
 from sbrdf_jax.resampling.guided.error_model import MAX_FACTOR, estimate_floor, noise_factors
+from sbrdf_jax.resampling.guided.field import evaluate_on_axes as field_on_axes
+from sbrdf_jax.resampling.guided.field import evaluate_with_error, evaluated_part, field_whitener
 from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out, lower_inverse, mirror_lower
 from sbrdf_jax.resampling.guided.lobe_fit import fit_lobe_model
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value, lobe_terms
@@ -114,8 +116,8 @@ def plain_weights(x, axis):
 
 def plain_features(at, name):
     """All modes of a grid at directions, as one matrix [direction, mode]."""
-    places = (getattr(at, name), at.theta_i, at.theta_o)
-    along = [plain_weights(x, axis) @ axis.modes for x, axis in zip(places, GRIDS[name], strict=True)]
+    grid = GRIDS[name]
+    along = [plain_weights(x, axis) @ axis.modes for x, axis in zip(grid.places(at), grid.axes, strict=True)]
     return np.einsum("ni,nj,nk->nijk", *along).reshape(len(along[0]), -1)
 
 
@@ -136,8 +138,8 @@ def test_generalised_logarithm_inverts(rng):
 
 
 def test_modes_are_orthonormal_functions():
-    for axes in GRIDS.values():
-        for axis in axes:
+    for grid in GRIDS.values():
+        for axis in grid.axes:
             trapezoid = np.full(axis.count, (axis.stop - axis.start) / (axis.count - 1))
             trapezoid[[0, -1]] /= 2
             gram = axis.modes[:, :-1].T @ (trapezoid[:, None] * axis.modes[:, :-1])
@@ -179,9 +181,10 @@ def test_covariance_and_nodes_equal_dense_matrices(rng, reciprocal):
     nodes = node_values(variance, centres.features, jnp.asarray(dual))
     read_back = sum(
         np.stack([
-            interpolate(mirror(values), (getattr(at, name)[k], at.theta_i[k], at.theta_o[k]), axes) for k in range(9)
+            interpolate(mirror(nodes[name]), jax.tree.map(lambda x, k=k: x[k], grid.places(at)), grid.axes)
+            for k in range(9)
         ])
-        for values, (name, axes) in zip(nodes, GRIDS.items(), strict=True)
+        for name, grid in GRIDS.items()
     )  # fmt: skip
     np.testing.assert_allclose(read_back, found @ dual, rtol=1e-8)
 
@@ -290,6 +293,18 @@ def test_values_along_axes_are_those_of_the_directions(field):
     found = evaluate_where(field, *axes, where)
     np.testing.assert_allclose(found, evaluate_in_chunks(field, *(a[where] for a in mesh)), rtol=1e-9, atol=1e-13)
     assert evaluate_where(field, *axes, np.zeros_like(where)).shape == (0, np.size(field.wavelength_nm))
+
+
+def test_host_and_device_evaluate_alike(field, rng):
+    """NumPy with sparse rows and a triangle, JAX with gathered nodes and blocks: the same values and errors."""
+    part, whiten = evaluated_part(field), field_whitener(field)
+    angles = [np.asarray(a) for a in random_directions(rng, 30)]
+    compiled = jax.jit(evaluate_with_error.__wrapped__)
+    for one, other in zip(evaluate_with_error(part, whiten, *angles), compiled(part, whiten, *angles), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-14)
+    axes = np.asarray(0.4), np.array([0.0, 0.5, 1.2]), np.array([0.0, 1.0, np.pi])
+    found = field_on_axes(jax.tree.map(np.asarray, part), *axes)
+    np.testing.assert_allclose(found, jax.jit(field_on_axes)(part, *axes), rtol=1e-9, atol=1e-14)
 
 
 def test_a_material_with_another_curve_compiles_nothing(field):
@@ -477,6 +492,19 @@ def test_a_result_holds_the_field_and_its_errors(samples, tmp_path, rng):
             del file["field/measured"][name]
     older = evaluate_in_chunks(load_stage(path, "grid"), *nodes)
     np.testing.assert_allclose(older, grid.brdf, rtol=1e-9, atol=1e-12)
+    with h5py.File(path, "a") as file:  # and before there was a grid over the difference angle
+        for name in (
+            "difference",
+            "lobe/mirror_power",
+            *(f"variance/along_{x}" for x in ("half", "difference", "lean")),
+        ):
+            del file["field"][name]
+    field = load(path).gridded.field
+    assert field.lobe.mirror_power == 2.0 and not field.difference.any() and not field.variance.difference.any()
+    lobe = dataclasses.replace(grid.field.lobe, mirror_power=2.0)
+    kept = dataclasses.replace(grid.field, lobe=lobe, difference=np.zeros_like(grid.field.difference))
+    expected = evaluate_in_chunks(kept, *nodes)
+    np.testing.assert_allclose(evaluate_in_chunks(load_stage(path, "grid"), *nodes), expected, rtol=1e-9, atol=1e-12)
 
 
 def test_held_out_samples_of_a_measured_paint(shared):

@@ -33,8 +33,8 @@ def guided_field(rng, group=6, member=8) -> GuidedField:
     """A field of random numbers, as large as a real one but for its centres."""
     lanes = len(MEASURED_NM)
     residual = {
-        name: mirror(jnp.asarray(0.1 * rng.standard_normal((*(axis.count for axis in axes), lanes))))
-        for name, axes in GRIDS.items()
+        name: mirror(jnp.asarray(0.1 * rng.standard_normal((*(axis.count for axis in grid.axes), lanes))))
+        for name, grid in GRIDS.items()
     }
     centre = np.stack([*rng.uniform(0.1, 1.2, (2, group, member)), rng.uniform(0, np.pi, (group, member))])
     amplitude = rng.uniform(-3.0, -1.0, (4, lanes))

@@ -182,7 +182,7 @@ def describe_spike(field: GuidedField) -> list[str]:
     field = jax.tree.map(np.asarray, field)
     angle = np.asarray(SPIKE_THETA)
     at = guided_coordinates(angle, angle, np.asarray(np.pi), field.theta_limit)
-    term = lobe_terms(field.lobe.shape, at)[:, None] * np.exp(field.lobe.log_amplitude)
+    term = lobe_terms(field.lobe.shape, at, field.lobe.mirror_power)[:, None] * np.exp(field.lobe.log_amplitude)
     spiky = term[MIRROR_TERM] > np.delete(term, MIRROR_TERM, axis=0).sum(axis=0)
     width = np.rad2deg(np.arctan(np.exp(field.lobe.shape[1])))
     centres = guided_coordinates(*field.centre, field.theta_limit)

@@ -32,6 +32,8 @@ class Coordinates:
     theta_o: Any  # rad, clamped
     tan2_half: Any  # tan(theta_h)^2
     cos_difference: Any  # cosine of the angle between half vector and incidence
+    difference: Any  # that angle [rad]
+    lean: Any  # theta_i - theta_o [rad]
 
 
 def guided_coordinates(
@@ -60,7 +62,9 @@ def guided_coordinates(
     tangential2 = (sin_i - sin_o) ** 2 + 4 * sin_i * sin_o * xp.cos(azimuth / 2) ** 2
     normal = xp.cos(theta_i) + xp.cos(theta_o)
     theta_h = xp.arctan2(xp.sqrt(tangential2 + 1e-24), normal)
-    cos_difference = xp.sqrt(tangential2 + normal**2) / 2
+    twice_cos_difference = xp.sqrt(tangential2 + normal**2)
+    apart2 = (sin_i - sin_o) ** 2 + 4 * sin_i * sin_o * xp.sin(azimuth / 2) ** 2
+    apart2 = apart2 + (xp.cos(theta_i) - xp.cos(theta_o)) ** 2
     blend = sin_i * sin_o / (sin_i * sin_o + POLE_BLEND)
     return Coordinates(
         half=xp.log1p(xp.rad2deg(theta_h)),
@@ -68,7 +72,9 @@ def guided_coordinates(
         theta_i=theta_i,
         theta_o=theta_o,
         tan2_half=tangential2 / xp.maximum(normal, 1e-3) ** 2,
-        cos_difference=xp.clip(cos_difference, 0.0, 1.0),
+        cos_difference=xp.clip(twice_cos_difference / 2, 0.0, 1.0),
+        difference=xp.arctan2(xp.sqrt(apart2 + 1e-24), twice_cos_difference),
+        lean=theta_i - theta_o,
     )
 
 
@@ -82,8 +88,8 @@ def coordinates_on_axes(
 
 
 def exchanged(at: Coordinates) -> Coordinates:
-    """Return the coordinates of the same light the other way: half angle and azimuth do not change."""
-    return dataclasses.replace(at, theta_i=at.theta_o, theta_o=at.theta_i)
+    """Return the coordinates of the same light the other way: half vector and azimuth do not change."""
+    return dataclasses.replace(at, theta_i=at.theta_o, theta_o=at.theta_i, lean=-at.lean)
 
 
 def floored_cos(theta: Float[AnyArray, "*shape"]) -> Float[AnyArray, "*shape"]:

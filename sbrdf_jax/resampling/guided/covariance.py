@@ -3,7 +3,8 @@
 With samples A x, energy x' E x and noise N, the normal equations (A' N^-1 A + E) x = A' N^-1 r
 have the dual (A E^-1 A' + N) a = r, x = E^-1 A' a: as large as the samples, not the nodes.
 Samples of one incident angle share the modes of theta_i, so A E^-1 A' needs the modes of
-the two other axes only, once per pair of a direction and an incident angle. Nodes tied by
+the two other axes only, once per pair of a direction and an incident angle; of the difference
+grid it is a sum of products of one small matrix product an axis. Nodes tied by
 reciprocity are the mean of both ways: A becomes (A + A exchanged) / 2.
 """
 
@@ -19,7 +20,11 @@ from sbrdf_jax.array_module import AnyArray, array_module
 from sbrdf_jax.records import pytree
 from sbrdf_jax.resampling.guided.coordinates import Coordinates, coordinates_on_axes, exchanged, guided_coordinates
 from sbrdf_jax.resampling.guided.nodes import (
+    DIFFERENCE,
     GRIDS,
+    HALF,
+    LEAN,
+    POLAR_GRIDS,
     THETA,
     Features,
     ModeVariance,
@@ -38,6 +43,7 @@ class GroupedFeatures:
     theta_i: Any  # [group, mode]
     half: Any  # [group, member, mode]
     azimuth: Any  # [group, member, mode]
+    along: tuple[Any, Any, Any]  # [centre, mode] of each axis of the difference grid
 
 
 def group_coordinates(angles: Float[AnyArray, "3 group member"], theta_limit: Float[AnyArray, " 2"]) -> Coordinates:
@@ -50,7 +56,8 @@ def group_coordinates(angles: Float[AnyArray, "3 group member"], theta_limit: Fl
 def group_features(at: Coordinates) -> GroupedFeatures:
     """Return the features of grouped centres [group, member], of one theta_i each group."""
     features = features_of(at)
-    return GroupedFeatures(theta_i=features.theta_i[:, 0], half=features.half, azimuth=features.azimuth)
+    along = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), features.along)
+    return GroupedFeatures(features.theta_i[:, 0], features.half, features.azimuth, along)
 
 
 def flatten(at: Coordinates) -> Coordinates:
@@ -65,12 +72,30 @@ def _by_theta_i(variance):
 
 def _covariance(variance: ModeVariance, left: Features, right: GroupedFeatures):
     xp, total = array_module(left.theta_i, right.theta_i), 0.0
-    for name in GRIDS:
+    for name in POLAR_GRIDS:
         pairs = left.theta_i[:, None, :] * right.theta_i[None, :, :]  # [direction, group, mode]
         weighted = (pairs @ _by_theta_i(getattr(variance, name))) * getattr(left, name)[:, None, :]
         # [direction, group, other mode] with [group, member, other mode], group by group
         total = total + xp.swapaxes(weighted, 0, 1) @ xp.swapaxes(getattr(right, name), 1, 2)
-    return xp.swapaxes(total, 0, 1).reshape(left.theta_i.shape[0], -1)
+    return xp.swapaxes(total, 0, 1).reshape(left.theta_i.shape[0], -1) + _along_axes(variance, left.along, right.along)
+
+
+def _along_axes(variance: ModeVariance, left, right):
+    """Covariance [*direction, centre] by the difference grid of features [*direction, mode] and [centre, mode]."""
+    total = 0.0
+    for term in zip(*variance.along, strict=True):
+        one, two, three = (x @ (weight[:, None] * y.T) for x, weight, y in zip(left, term, right, strict=True))
+        total = total + one * two * three
+    return total
+
+
+def _own_along_axes(variance: ModeVariance, left, right):
+    """Covariance [*direction] by the difference grid of pairs of directions, of features [*direction, mode]."""
+    total = 0.0
+    for term in zip(*variance.along, strict=True):
+        one, two, three = ((x * y) @ weight for x, y, weight in zip(left, right, term, strict=True))
+        total = total + one * two * three
+    return total
 
 
 def covariance(
@@ -105,8 +130,8 @@ def prior_variance(variance: ModeVariance, at: Coordinates) -> Float[AnyArray, "
     features = features_of(at)
 
     def with_features(others: Features):
-        total = 0.0
-        for name in GRIDS:
+        total = _own_along_axes(variance, features.along, others.along)
+        for name in POLAR_GRIDS:
             weight = (features.theta_i * others.theta_i) @ _by_theta_i(getattr(variance, name))
             total = total + (weight * getattr(features, name) * getattr(others, name)).sum(axis=1)
         return total
@@ -136,38 +161,52 @@ def covariance_on_axes(
     polar = along_i[:, :, None] * along_o[:, None, :]  # [o, mode of theta_i, mode of theta_o]
     if variance.reciprocal:
         polar = (polar + xp.swapaxes(polar, 1, 2)) / 2
-    total, prior = 0.0, 0.0
-    for name, (axis, _, _) in GRIDS.items():
-        around, at_centre = axis_features(getattr(at, name), axis), axis_features(getattr(places, name), axis)
+    lean = axis_features(at.lean[:, :1], LEAN)  # the same for all azimuths
+    if variance.reciprocal:
+        lean = (lean + axis_features(-at.lean[:, :1], LEAN)) / 2
+    along = lean, axis_features(at.half, HALF), axis_features(at.difference, DIFFERENCE)
+    total, prior = 0.0, _own_along_axes(variance, along, along)
+    for name, grid in POLAR_GRIDS.items():
+        around, at_centre = (axis_features(getattr(x, name), grid.axes[0]) for x in (at, places))
         weighted = polar[:, None] * getattr(variance, name)[None]  # [o, first mode, two modes]
         of_first = (weighted * polar[:, None]).sum(axis=(2, 3))
         prior = prior + (around**2 @ of_first[:, :, None])[:, :, 0]
         of_group = xp.tensordot(centre_i, weighted, (1, 2))  # [group, o, first mode, mode of theta_o]
         of_centre = of_group @ xp.swapaxes(centre_o, 1, 2)[:, None] * xp.swapaxes(at_centre, 1, 2)[:, None]
         total = total + around[None] @ of_centre  # [group, o, p, member]
-    return xp.moveaxis(total, 0, 2).reshape(*at.half.shape, -1), prior
+    total = xp.moveaxis(total, 0, 2).reshape(*at.half.shape, -1)
+    return total + _along_axes(variance, along, group_features(places).along), prior
 
 
 def mode_sums(
     centres: GroupedFeatures, dual: Float[AnyArray, "centre wavelength"]
-) -> dict[str, Float[AnyArray, "first theta_i theta_o wavelength"]]:
-    """Sum the centres' features, weighed by `dual`: A' in terms of modes, for both grids."""
+) -> dict[str, Float[AnyArray, "first second third wavelength"]]:
+    """Sum the centres' features, weighed by `dual`: A' in terms of modes, for each grid."""
     xp, grouped = array_module(centres.half, dual), dual.reshape(*centres.half.shape[:2], -1)
     sums = {}
-    for name, axes in GRIDS.items():
+    for name, (_, axes) in POLAR_GRIDS.items():
         by_group = xp.swapaxes(getattr(centres, name), 1, 2) @ grouped
         modes = xp.tensordot(centres.theta_i, by_group, (0, 0))
         modes = modes.reshape(axes[1].count, axes[0].count, axes[2].count, -1)
         sums[name] = xp.moveaxis(modes, 0, 1)
+    lean, half, difference = centres.along
+    others, weighted = lean[:, :, None] * half[:, None, :], dual[:, :, None] * difference[:, None, :]
+    sums["difference"] = xp.moveaxis(xp.tensordot(others, weighted, (0, 0)), 2, 3)
     return sums
 
 
 def node_values(
     variance: ModeVariance, centres: GroupedFeatures, dual: Float[AnyArray, "centre wavelength"]
-) -> tuple[Float[AnyArray, "half theta_i theta_o wavelength"], Float[AnyArray, "azimuth theta_i theta_o wavelength"]]:
-    """Return the nodes x = E^-1 A' a of both grids, from dual coefficients a."""
+) -> dict[str, Float[AnyArray, "first second third wavelength"]]:
+    """Return the nodes x = E^-1 A' a of each grid, from dual coefficients a."""
     sums = mode_sums(centres, dual)
     if variance.reciprocal:
-        sums = {name: (modes + array_module(modes).swapaxes(modes, 1, 2)) / 2 for name, modes in sums.items()}
-    half, azimuth = (synthesise(sums[name] * getattr(variance, name)[..., None], axes) for name, axes in GRIDS.items())
-    return half, azimuth
+        for name in POLAR_GRIDS:
+            sums[name] = (sums[name] + array_module(dual).swapaxes(sums[name], 1, 2)) / 2
+        is_even = np.where(
+            np.arange(LEAN.count) % 2 == 0, 1.0, 0.0
+        )  # the other modes change sign with theta_i - theta_o
+        sums["difference"] = sums["difference"] * is_even[:, None, None, None]
+    return {
+        name: synthesise(modes * getattr(variance, name)[..., None], GRIDS[name].axes) for name, modes in sums.items()
+    }

@@ -175,7 +175,7 @@ def restore_estimates(field: GuidedField, samples: RawSamples, centres: Centres)
     """
     floor = float(field.floor)
     field = jax.tree.map(np.asarray, field)
-    lobe = LobeModel(field.lobe.shape, field.measured.log_amplitude)
+    lobe = dataclasses.replace(field.lobe, log_amplitude=field.measured.log_amplitude)
     residual, model = _split(centres, *_sample_logarithm(samples, floor, centres), lobe, floor)
     spectra = SpectralFilter(field.measured.to_component, field.measured.from_component)
     residual = _filtered(spectra, residual, model)

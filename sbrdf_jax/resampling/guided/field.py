@@ -7,10 +7,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
+import scipy.linalg.blas
 from jaxtyping import Array, Float
 
 from sbrdf_jax.array_module import AnyArray, array_module
+from sbrdf_jax.devices import on_host
+from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.records import pytree
 from sbrdf_jax.resampling.guided.coordinates import (
     Coordinates,
@@ -31,14 +33,26 @@ from sbrdf_jax.resampling.guided.covariance import (
 from sbrdf_jax.resampling.guided.error_model import ResidualScale, residual_scale
 from sbrdf_jax.resampling.guided.inverse import whitener
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
-from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, cubic_matrix, cubic_weights, interpolate
+from sbrdf_jax.resampling.guided.nodes import (
+    DIFFERENCE,
+    GRIDS,
+    HALF,
+    LEAN,
+    POLAR_GRIDS,
+    ModeVariance,
+    cubic_matrix,
+    cubic_rows,
+    cubic_weights,
+    interpolate,
+)
 
+Values = Float[AnyArray, "direction wavelength"]
 DIRECTIONS_AT_A_TIME = 1024
 WHITEN_BLOCK = 256  # rows of a triangular matrix that are multiplied as one full block
 MOST_GATHERED = 8  # wavelengths; measured: 1.8 us a direction against 6.1 for 1, 5.0 and 7.4 for 6, 46 and 16 for 31
 
 NEVER_EVALUATED = ("multiplier", "model_residual", "reciprocity_cost", "curve", "measured")
-LAST_AXIS = ("wavelength_nm", "half", "azimuth", "multiplier", "model_residual")  # is the wavelength's, in a field
+LAST_AXIS = ("wavelength_nm", *GRIDS, "multiplier", "model_residual")  # is the wavelength's, in a field
 
 
 @pytree()
@@ -66,6 +80,7 @@ class GuidedField:
     lobe: LobeModel
     half: Any  # [half, theta_i, theta_o, wavelength] residual of z at the nodes of the half-angle grid, mirrored
     azimuth: Any  # [azimuth, theta_i, theta_o, wavelength] the same of the azimuth grid
+    difference: Any  # [lean, half, difference, wavelength] the same of the difference grid
     theta_limit: Any  # [2] rad
     centre: Any  # [3, group, member] theta_i, theta_o, folded azimuth [rad]
     noise: Any  # [group, member] variance of z relative to the prior's
@@ -99,8 +114,8 @@ def evaluate_direction(
 
 def _log_value(field: GuidedField, at: Coordinates):
     z = lobe_log_value(field.lobe, at, field.floor)
-    for name, axes in GRIDS.items():
-        z = z + interpolate(getattr(field, name), (getattr(at, name), at.theta_i, at.theta_o), axes)
+    for name, grid in GRIDS.items():
+        z = z + interpolate(getattr(field, name), grid.places(at), grid.axes)
     return z
 
 
@@ -112,17 +127,18 @@ def evaluate_directions(
 ) -> Float[np.ndarray, "direction wavelength"]:
     """`evaluate_direction` of many directions on the host: the nodes around each are a row of a sparse matrix."""
     at = guided_coordinates(theta_i, theta_o, phi_o, field.theta_limit)
+    return from_log(_log_values(field, at), log_scale(at, field.floor))
+
+
+def _log_values(field: GuidedField, at: Coordinates):
+    """`_log_value` of many directions."""
+    if array_module(field.half, at.half) is not np:
+        return each_direction(lambda place: _log_value(field, place), at, len(field.wavelength_nm))
     z = lobe_log_value(field.lobe, at, field.floor)
-    for name, axes in GRIDS.items():
-        nodes, places = getattr(field, name), (getattr(at, name), at.theta_i, at.theta_o)
-        first, (over, over_i, over_o) = zip(*map(cubic_weights, places, axes), strict=True)
-        around = np.ravel_multi_index(tuple(np.indices((4, 4, 4)).reshape(3, -1)), nodes.shape[:3])
-        index = (np.ravel_multi_index(first, nodes.shape[:3])[:, None] + around).astype(np.int32)
-        product = over[:, :, None] * (over_i[:, :, None] * over_o[:, None, :]).reshape(-1, 1, 4**2)
-        start = np.arange(0, product.size + 1, 4**3, dtype=np.int32)
-        rows = scipy.sparse.csr_array((product.ravel(), index.ravel(), start), (len(theta_i), np.prod(nodes.shape[:3])))
-        z = z + rows @ nodes.reshape(-1, nodes.shape[3])
-    return from_log(z, log_scale(at, field.floor))
+    for name, grid in GRIDS.items():
+        nodes = getattr(field, name)
+        z = z + cubic_rows(grid.places(at), grid.axes) @ nodes.reshape(-1, nodes.shape[3])
+    return z
 
 
 def each_direction(function: Callable[[Any], Array], directions: Any, num_wavelengths: int) -> Array:
@@ -140,20 +156,23 @@ def field_whitener(field: GuidedField) -> np.ndarray:
     return whitener(prior, np.asarray(field.noise).reshape(-1))
 
 
-@jax.jit
 def unexplained(
-    cross: Float[Array, "direction centre"],
-    prior: Float[Array, " direction"],
-    whiten: Float[Array, "centre centre"],
-) -> Float[Array, " direction"]:
+    cross: Float[AnyArray, "direction centre"],
+    prior: Float[AnyArray, " direction"],
+    whiten: Float[AnyArray, "centre centre"],
+) -> Float[AnyArray, " direction"]:
     """Variance that the centres leave in directions, relative to the prior's: the same at every wavelength.
 
     Args:
         cross: Prior covariance of directions and centres.
         prior: Prior variance of the directions.
-        whiten: Inverse Cholesky factor of prior plus noise, from `field_whitener`: lower triangular, so block
-            by block what is zero is left out.
+        whiten: Inverse Cholesky factor of prior plus noise, from `field_whitener`: lower triangular, so that
+            BLAS multiplies by it as such, and else what is zero is left out block by block.
     """
+    if array_module(cross, whiten) is np:
+        with one_blas_thread():
+            product = scipy.linalg.blas.dtrmm(1.0, whiten, cross.T, lower=1)
+        return np.maximum(prior - np.einsum("cd,cd->d", product, product), 0.0)
     count, explained = len(whiten), 0.0
     for start in range(0, count, WHITEN_BLOCK):
         end = min(start + WHITEN_BLOCK, count)
@@ -169,16 +188,14 @@ def _errors(field: GuidedField, at: Coordinates, z, variance):
     return from_log(z, scale), unit * xp.sqrt(variance)[..., None], unit * xp.sqrt(field.noise_level)
 
 
-@jax.jit
+@on_host
 def evaluate_with_error(
     field: GuidedField,
-    whiten: Float[Array, "centre centre"],
-    theta_i: Float[Array, " direction"],
-    theta_o: Float[Array, " direction"],
-    phi_o: Float[Array, " direction"],
-) -> tuple[
-    Float[Array, "direction wavelength"], Float[Array, "direction wavelength"], Float[Array, "direction wavelength"]
-]:
+    whiten: Float[AnyArray, "centre centre"],
+    theta_i: Float[AnyArray, " direction"],
+    theta_o: Float[AnyArray, " direction"],
+    phi_o: Float[AnyArray, " direction"],
+) -> tuple[Values, Values, Values]:
     """Evaluate the field, its standard error, and the noise of one measurement [1/sr], at the measured wavelengths.
 
     The shape of the error comes from the same matrix as the field, its local scale from
@@ -192,14 +209,14 @@ def evaluate_with_error(
         theta_o: Polar angle of exitance [rad].
         phi_o: Azimuth of exitance [rad]; the mirror direction is at pi.
     """
-    features = group_features(group_coordinates(jnp.asarray(field.centre), jnp.asarray(field.theta_limit)))
+    features = group_features(group_coordinates(field.centre, field.theta_limit))
 
     def of_chunk(angles):
         at = guided_coordinates(*angles, field.theta_limit)
         cross = covariance(field.variance, at, features)
         variance = unexplained(cross, prior_variance(field.variance, at), whiten)
-        z = each_direction(lambda place: _log_value(field, place), at, len(field.wavelength_nm))
-        return jnp.stack(_errors(field, at, z, variance), axis=1)
+        z = _log_values(field, at)
+        return array_module(z).stack(_errors(field, at, z, variance), axis=1)
 
     found = in_chunks(of_chunk, (theta_i, theta_o, phi_o), DIRECTIONS_AT_A_TIME)
     return found[:, 0], found[:, 1], found[:, 2]
@@ -229,7 +246,8 @@ def _log_value_on_axes(field: GuidedField, theta_i, theta_o, phi_o) -> tuple[Coo
     """Coordinates and z; nodes are summed over both polar angles once for all azimuths."""
     at = coordinates_on_axes(theta_i, theta_o, phi_o, field.theta_limit)
     z = lobe_log_value(field.lobe, at, field.floor)
-    for name, (axis, axis_i, axis_o) in GRIDS.items():
+    z = z + _difference_on_axes(field.difference, at)
+    for name, (_, (axis, axis_i, axis_o)) in POLAR_GRIDS.items():
         xp, nodes = array_module(z), getattr(field, name)
         first, weight = cubic_weights(at.theta_i[0, :1], axis_i)
         around = nodes[:, first[0] : first[0] + 4] if xp is np else jax.lax.dynamic_slice_in_dim(nodes, first[0], 4, 1)
@@ -237,3 +255,15 @@ def _log_value_on_axes(field: GuidedField, theta_i, theta_o, phi_o) -> tuple[Coo
         nodes = cubic_matrix(at.theta_o[:, 0], axis_o)[None] @ nodes  # [first node, o, wavelength]
         z = z + cubic_matrix(getattr(at, name), axis) @ xp.swapaxes(nodes, 0, 1)
     return at, z
+
+
+def _difference_on_axes(nodes, at: Coordinates) -> AnyArray:
+    """What the difference grid adds [o, p, wavelength]; its first coordinate is the same for all azimuths."""
+    xp = array_module(nodes, at.lean)
+    of_lean = xp.tensordot(cubic_matrix(at.lean[:, 0], LEAN), nodes, (1, 0))  # [o, half, difference, wavelength]
+    if xp is np:
+        flat = of_lean.reshape(len(of_lean), -1, nodes.shape[-1])
+        rows = cubic_rows((at.half.ravel(), at.difference.ravel()), (HALF, DIFFERENCE), blocks=len(flat))
+        return (rows @ flat.reshape(-1, nodes.shape[-1])).reshape(*at.half.shape, -1)
+    halfway = jnp.einsum("oph,ohdw->opdw", cubic_matrix(at.half, HALF), of_lean)
+    return jnp.einsum("opd,opdw->opw", cubic_matrix(at.difference, DIFFERENCE), halfway)

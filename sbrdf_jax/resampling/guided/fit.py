@@ -1,5 +1,6 @@
 """From the estimates of a whole measurement to the field at the wavelengths that are needed."""
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,6 @@ from sbrdf_jax.resampling.guided.centres import Centres
 from sbrdf_jax.resampling.guided.covariance import node_values
 from sbrdf_jax.resampling.guided.estimates import Estimates
 from sbrdf_jax.resampling.guided.field import GuidedField, WholeSpectrum
-from sbrdf_jax.resampling.guided.lobe_model import LobeModel
 from sbrdf_jax.resampling.guided.nodes import mirror
 
 
@@ -38,15 +38,13 @@ def solve_field(estimates: Estimates, centres: Centres, needed: np.ndarray, tole
     parts = (estimates.inverse, estimates.noise, estimates.residual[:, needed], estimates.model[:, needed])
     bounded = solve_bounded(prior, *parts, ProjectedNewton(tolerance=tolerance))
     with one_blas_thread():
-        half_nodes, azimuth_nodes = node_values(estimates.variance, centres.features, bounded.dual)
+        nodes = node_values(estimates.variance, centres.features, bounded.dual)
     amplitude = estimates.lobe.log_amplitude
     shape = (3, centres.num_groups, centres.num_members)
     field = GuidedField(
         wavelength_nm=estimates.wavelength_nm[needed],
         floor=np.asarray(estimates.floor),
-        lobe=LobeModel(estimates.lobe.shape, amplitude[:, needed]),
-        half=mirror(half_nodes),
-        azimuth=mirror(azimuth_nodes),
+        lobe=dataclasses.replace(estimates.lobe, log_amplitude=amplitude[:, needed]),
         theta_limit=centres.theta_limit,
         centre=centres.angles.reshape(shape),
         noise=estimates.noise.reshape(shape[1:]),
@@ -61,5 +59,6 @@ def solve_field(estimates: Estimates, centres: Centres, needed: np.ndarray, tole
         measured=WholeSpectrum(
             estimates.wavelength_nm, amplitude, estimates.model_residual, *estimates.spectral_filter
         ),
+        **{name: mirror(values) for name, values in nodes.items()},
     )
     return GuidedFit(field, bounded.kkt_residual, bounded.num_steps, bounded.status, estimates.whiten)

@@ -17,8 +17,8 @@ from sbrdf_jax.resampling.guided.lobe_slopes import lobe_slopes
 NUM_TERMS = 4  # diffuse, mirror, narrow lobe, broad lobe
 NUM_FIT_WAVELENGTHS = 8  # the shared shape is fitted to about so many
 PRIOR = np.array([np.log(0.5), np.log(0.0122), np.log(0.06), np.log(0.25), 1.0, 1.0, 1.0, 1.0, 0.5])
-PRIOR_SPREAD = np.array([0.5, 0.1, 0.7, 0.5, 0.5, 0.5, 0.5, 0.5, 0.25])
-LOWER = np.array([np.log(0.2), np.log(0.0087), np.log(0.03), np.log(0.1), 0.0, 0.0, 0.0, 0.0, 0.0])
+PRIOR_SPREAD = np.array([0.5, 0.3, 0.7, 0.5, 0.5, 0.5, 0.5, 0.5, 0.25])
+LOWER = np.array([np.log(0.2), np.log(0.004), np.log(0.03), np.log(0.1), 0.0, 0.0, 0.0, 0.0, 0.0])
 UPPER = np.array([np.log(2.0), np.log(0.02), np.log(0.25), np.log(1.0), 1.5, 1.5, 1.5, 1.5, 1.0])
 PRIOR_WEIGHT = 2e-4  # of the whole data weight, per squared spread
 LOSS_SCALE = 0.3  # residual in z where the soft-L1 loss turns from square to linear

@@ -13,7 +13,6 @@ from sbrdf_jax.array_module import AnyArray, array_module
 from sbrdf_jax.records import pytree
 from sbrdf_jax.resampling.guided.coordinates import Coordinates, floored_cos, log_scale, to_log
 
-MIRROR_POWER = 2  # of tan^2 theta_h: an aperture's image is flatter than a Gaussian, and steeper at its edge
 SHAPE_NAMES = (
     "log(n-1)", "log(mirror_width)", "log(narrow_width)", "log(broad_width)", "narrow_fresnel", "narrow_shadowing",
     "broad_fresnel", "broad_shadowing", "mirror_grazing",
@@ -21,12 +20,13 @@ SHAPE_NAMES = (
 HIGHEST_EXPONENT = 700.0  # exp of more overflows
 
 
-@pytree()
+@pytree(static=("mirror_power",))
 class LobeModel:
     """A fitted model: the shape is shared, the amplitudes are per wavelength."""
 
     shape: Any  # [9], SHAPE_NAMES
     log_amplitude: Any  # [4, wavelength]; in units of the floor's scale: exp gives 1/sr
+    mirror_power: float = 1.0  # of (tan theta_h / width)^2 in the mirror term: 2 in results of earlier versions
 
 
 def fresnel(cos, index):
@@ -44,10 +44,10 @@ def log_shadowing(width, cos):
     return xp.log(2 / ((1 + xp.sqrt(1 + width**2 * (1 - cos**2) / cos**2)) * cos))
 
 
-def lobe_terms(shape: Float[AnyArray, " 9"], at: Coordinates) -> Float[AnyArray, "*shape 4"]:
+def lobe_terms(shape: Float[AnyArray, " 9"], at: Coordinates, mirror_power: float = 1.0) -> Float[AnyArray, "*shape 4"]:
     """Return the four terms at amplitude 1, finite everywhere; Fresnel factors are 1 at normal incidence.
 
-    Diffuse: (1 - F(theta_i)) (1 - F(theta_o)). Mirror: F(theta_d) exp(-(tan theta_h / width)^4)
+    Diffuse: (1 - F(theta_i)) (1 - F(theta_o)). Mirror: F(theta_d) exp(-(tan theta_h / width)^(2 mirror_power))
     (cos_i cos_o)^-mirror_grazing. Lobes: F(theta_d)^fresnel (G1(i) G1(o) / (cos_i cos_o))^shadowing
     (1 + tan^2 theta_h / width^2)^-2 / cos^4 theta_h.
     """
@@ -57,8 +57,8 @@ def lobe_terms(shape: Float[AnyArray, " 9"], at: Coordinates) -> Float[AnyArray,
     cos_i, cos_o = floored_cos(at.theta_i), floored_cos(at.theta_o)
     log_fresnel = xp.log(fresnel(at.cos_difference, index) / fresnel(1.0, index))
     diffuse = (1 - fresnel(cos_i, index)) * (1 - fresnel(cos_o, index))
-    ratio = xp.minimum(at.tan2_half / width[0] ** 2, HIGHEST_EXPONENT ** (1 / MIRROR_POWER))
-    mirror = xp.exp(log_fresnel - ratio**MIRROR_POWER) * (cos_i * cos_o) ** -shape[8]
+    steep = xp.minimum((at.tan2_half / width[0] ** 2) ** mirror_power, HIGHEST_EXPONENT)
+    mirror = xp.exp(log_fresnel - steep) * (cos_i * cos_o) ** -shape[8]
     terms = [diffuse, mirror]
     for k, fresnel_power, shadowing_power in ((1, shape[4], shape[5]), (2, shape[6], shape[7])):
         shadowing = xp.zeros_like(cos_i)
@@ -74,5 +74,5 @@ def lobe_log_value(
 ) -> Float[AnyArray, "*shape wavelength"]:
     """Generalised logarithm z of the model."""
     xp = array_module(model.shape, at.theta_i)
-    value = lobe_terms(model.shape, at) @ xp.exp(model.log_amplitude)
+    value = lobe_terms(model.shape, at, model.mirror_power) @ xp.exp(model.log_amplitude)
     return to_log(value, log_scale(at, floor))

@@ -4,13 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sbrdf_jax.resampling.guided.coordinates import Coordinates, floored_cos
-from sbrdf_jax.resampling.guided.lobe_model import (
-    HIGHEST_EXPONENT,
-    MIRROR_POWER,
-    fresnel,
-    lobe_terms,
-    log_shadowing,
-)
+from sbrdf_jax.resampling.guided.lobe_model import HIGHEST_EXPONENT, fresnel, lobe_terms, log_shadowing
 
 DIFFERENCE = 1e-5  # of log(n - 1), for central differences of Fresnel's formula
 
@@ -33,8 +27,7 @@ def lobe_slopes(shape: Float[np.ndarray, " 9"], at: Coordinates) -> Float[np.nda
     slopes[0, 0] = -by_index[0] * (1 - reflected[1]) - by_index[1] * (1 - reflected[0])
     slopes[0, 1] = mirror * fresnel_slope
     ratio = at.tan2_half / np.exp(2 * shape[1])
-    steep = np.where(ratio < HIGHEST_EXPONENT ** (1 / MIRROR_POWER), ratio, 0.0) ** MIRROR_POWER
-    slopes[1, 1] = mirror * 2 * MIRROR_POWER * steep
+    slopes[1, 1] = mirror * 2 * np.where(ratio < HIGHEST_EXPONENT, ratio, 0.0)
     for k, lobe in enumerate(lobes):
         width, (fresnel_power, shadowing_power) = np.exp(shape[2 + k]), shape[4 + 2 * k : 6 + 2 * k]
         shadowing, shadowing_slope = 0.0, 0.0

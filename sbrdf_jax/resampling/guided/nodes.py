@@ -1,4 +1,4 @@
-"""The two uniform grids that carry the residual, and the smoothness that ties their nodes.
+"""The three uniform grids that carry the residual, and the smoothness that ties their nodes.
 
 Xu, eq. (5), has a separable kernel at every node of a uniform grid, and eqs. (9) and (10)
 tie neighbours by second differences. Here the kernel is Keys' cubic (four nodes an axis,
@@ -6,15 +6,23 @@ mirrored at the ends), and the energy of a grid's nodes is diagonal in cosines: 
 cos(k_1 x) cos(k_2 y) cos(k_3 z) has the variance that a Matern spectrum gives its frequency.
 Of order 1/2 this is the energy of second differences, of order 3/2 one order smoother, so
 that x' E x, E^-1 and E^-1/2 all cost a few small matrix products.
+
+Two grids are over both polar angles. The third is over half and difference angle, of which
+most materials are a function: directions share what they have in common across incident
+angles, over short lengths. Its terms are Gaussian, order infinity, and so a product of
+functions of one coordinate each: fine nodes cost little.
 """
 
+import dataclasses
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 from jaxtyping import Array, Float, Int
 
 from sbrdf_jax.array_module import AnyArray, array_module
@@ -50,14 +58,34 @@ class Axis(NamedTuple):
 HALF = Axis(0.0, math.log(91.0), 33)  # log(theta_h [deg] + 1)
 AZIMUTH = Axis(0.0, math.pi, 25)  # rad, folded
 THETA = Axis(0.0, math.pi / 2, 19)  # rad, theta_i and theta_o
-GRIDS = {"half": (HALF, THETA, THETA), "azimuth": (AZIMUTH, THETA, THETA)}
+DIFFERENCE = Axis(0.0, math.pi / 2, 46)  # rad
+LEAN = Axis(-math.pi / 2, math.pi / 2, 9)  # rad
+
+
+class Grid(NamedTuple):
+    """Nodes over three coordinates of `Coordinates`."""
+
+    coordinates: tuple[str, str, str]
+    axes: tuple[Axis, Axis, Axis]
+
+    def places(self, at: Coordinates) -> tuple[Any, Any, Any]:
+        """Return where directions are along each axis."""
+        one, two, three = (getattr(at, name) for name in self.coordinates)
+        return one, two, three
+
+
+POLAR_GRIDS = {
+    "half": Grid(("half", "theta_i", "theta_o"), (HALF, THETA, THETA)),
+    "azimuth": Grid(("azimuth", "theta_i", "theta_o"), (AZIMUTH, THETA, THETA)),
+}
+GRIDS = POLAR_GRIDS | {"difference": Grid(("lean", "half", "difference"), (LEAN, HALF, DIFFERENCE))}
 
 
 class Term(NamedTuple):
     """One Matern term of the residual's prior."""
 
     grid: str  # a name of GRIDS
-    order: float  # 1/2: second differences; 3/2: one order smoother
+    order: float  # 1/2: second differences; 3/2: one order smoother; infinity, of "difference" alone: Gaussian
     variance: float
     lengths: tuple[float, float, float]  # in the grid's coordinates
 
@@ -68,7 +96,22 @@ class ModeVariance:
 
     half: Any  # [half, theta_i, theta_o]
     azimuth: Any  # [azimuth, theta_i, theta_o]
+    # of "difference": a sum over terms of products; no term in results of earlier versions
+    along_lean: Any = dataclasses.field(default_factory=lambda: np.zeros((0, LEAN.count)))  # [term, mode]
+    along_half: Any = dataclasses.field(default_factory=lambda: np.zeros((0, HALF.count)))  # [term, mode]
+    along_difference: Any = dataclasses.field(default_factory=lambda: np.zeros((0, DIFFERENCE.count)))  # [term, mode]
     reciprocal: bool = False  # nodes of exchanged theta_i and theta_o are tied
+
+    @property
+    def along(self) -> tuple[Any, Any, Any]:
+        """The factors of the difference grid's terms along each of its axes."""
+        return self.along_lean, self.along_half, self.along_difference
+
+    @property
+    def difference(self) -> Any:
+        """Variances [lean, half, difference], summed over the terms."""
+        xp = array_module(*self.along)
+        return xp.einsum("tl,th,td->lhd", *self.along)
 
 
 @functools.cache
@@ -76,24 +119,33 @@ def mode_variance(terms: tuple[Term, ...], constant: float, reciprocal: bool = F
     """Return the variances of a prior's modes.
 
     The spectrum of a Matern term of order v in three dimensions is proportional to
-    (2 v + |length x frequency|^2)^-(v + 3/2).
+    (2 v + |length x frequency|^2)^-(v + 3/2), of a Gaussian one to exp(-|length x frequency|^2 / 2).
 
     Args:
         terms: The prior's terms, which add up.
         constant: Variance of a constant added to all.
         reciprocal: Tie nodes by Helmholtz reciprocity.
     """
-    total = {name: np.zeros([axis.count for axis in axes]) for name, axes in GRIDS.items()}
+    total = {name: np.zeros([axis.count for axis in grid.axes]) for name, grid in POLAR_GRIDS.items()}
+    along: list[list[np.ndarray]] = []
     for term in terms:
-        axes, order = GRIDS[term.grid], term.order
+        axes, order = GRIDS[term.grid].axes, term.order
+        if order == math.inf:
+            along.append([
+                math.sqrt(2 * np.pi) * length * np.exp(-((length * axis.frequency) ** 2) / 2)
+                for length, axis in zip(term.lengths, axes, strict=True)
+            ])  # fmt: skip
+            along[-1][0] *= term.variance
+            continue
         steps = [(length * axis.frequency) ** 2 for length, axis in zip(term.lengths, axes, strict=True)]
         square = steps[0][:, None, None] + steps[1][None, :, None] + steps[2][None, None, :]
         level = 8 * np.pi**1.5 * math.gamma(order + 1.5) / math.gamma(order) * (2 * order) ** order
         total[term.grid] += term.variance * level * np.prod(term.lengths) * (2 * order + square) ** -(order + 1.5)
-    total["half"][0, 0, 0] += constant * np.prod([axis.stop - axis.start for axis in GRIDS["half"]])
+    total["half"][0, 0, 0] += constant * np.prod([axis.stop - axis.start for axis in GRIDS["half"].axes])
     if reciprocal:
         total = {name: (modes + np.swapaxes(modes, 1, 2)) / 2 for name, modes in total.items()}
-    return ModeVariance(half=total["half"], azimuth=total["azimuth"], reciprocal=reciprocal)
+    of_terms = [np.stack(factors) for factors in zip(*along, strict=True)]
+    return ModeVariance(total["half"], total["azimuth"], *of_terms, reciprocal=reciprocal)
 
 
 def cubic_weights(
@@ -136,6 +188,25 @@ def cubic_matrix(x: Float[AnyArray, "*shape"], axis: Axis) -> Float[AnyArray, "*
     return jnp.where(_four(first)[..., None] == nodes, weight[..., None], 0.0).sum(axis=-2)
 
 
+def cubic_rows(
+    places: Sequence[Float[np.ndarray, " direction"]], axes: Sequence[Axis], blocks: int = 1
+) -> scipy.sparse.csr_array:
+    """`cubic_weights` of several axes as sparse rows [direction, nodes], the mirrored ones included; on the host.
+
+    Of more than one block, each of as many directions, each has nodes of its own, [direction, block x nodes].
+    """
+    first, weight = zip(*map(cubic_weights, places, axes), strict=True)
+    shape = tuple(axis.count + 2 for axis in axes)
+    around = np.ravel_multi_index(tuple(np.indices((4,) * len(axes)).reshape(len(axes), -1)), shape)
+    block = np.repeat(np.arange(blocks) * math.prod(shape), len(places[0]) // blocks)
+    index = ((block + np.ravel_multi_index(first, shape))[:, None] + around).astype(np.int32)
+    product = weight[0]
+    for other in weight[1:]:
+        product = (product[:, :, None] * other[:, None, :]).reshape(len(product), -1)
+    start = np.arange(0, product.size + 1, 4 ** len(axes), dtype=np.int32)
+    return scipy.sparse.csr_array((product.ravel(), index.ravel(), start), (len(product), blocks * math.prod(shape)))
+
+
 def _four(first: Int[AnyArray, "*shape"]) -> Int[AnyArray, "*shape 4"]:
     return array_module(first).stack([first + np.int32(k) for k in range(4)], axis=-1)
 
@@ -155,31 +226,41 @@ class Features:
     theta_i: Any  # [*, mode]
     half: Any  # [*, mode of half x mode of theta_o]
     azimuth: Any  # [*, mode of azimuth x mode of theta_o]
+    along: tuple[Any, Any, Any]  # [*, mode] of each axis of the difference grid
 
 
 def features_of(at: Coordinates) -> Features:
     """Return the features of directions, given by their coordinates."""
     theta_o = axis_features(at.theta_o, THETA)
+    along = difference_features(at)
 
     def product(first):
         return (first[..., :, None] * theta_o[..., None, :]).reshape(*theta_o.shape[:-1], -1)
 
     return Features(
         theta_i=axis_features(at.theta_i, THETA),
-        half=product(axis_features(at.half, HALF)),
+        half=product(along[1]),
         azimuth=product(axis_features(at.azimuth, AZIMUTH)),
+        along=along,
     )
 
 
+def difference_features(at: Coordinates) -> tuple[Any, Any, Any]:
+    """Return the modes of directions [*, mode] along each axis of the difference grid."""
+    grid = GRIDS["difference"]
+    one, two, three = (axis_features(x, axis) for x, axis in zip(grid.places(at), grid.axes, strict=True))
+    return one, two, three
+
+
 def mirror(
-    nodes: Float[AnyArray, "first theta_i theta_o wavelength"],
+    nodes: Float[AnyArray, "first second third wavelength"],
 ) -> Float[AnyArray, "more more2 more3 wavelength"]:
     """Add one mirrored node at each end of the three axes."""
     return array_module(nodes).pad(nodes, ((1, 1), (1, 1), (1, 1), (0, 0)), mode="reflect")
 
 
 def interpolate(
-    mirrored: Float[Array, "first theta_i theta_o wavelength"],
+    mirrored: Float[Array, "first second third wavelength"],
     places: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]],
     axes: tuple[Axis, Axis, Axis],
 ) -> Float[Array, " wavelength"]:
@@ -197,8 +278,8 @@ def interpolate(
 
 
 def synthesise(
-    amplitude: Float[AnyArray, "first theta_i theta_o wavelength"], axes: tuple[Axis, Axis, Axis]
-) -> Float[AnyArray, "first theta_i theta_o wavelength"]:
+    amplitude: Float[AnyArray, "first second third wavelength"], axes: tuple[Axis, Axis, Axis]
+) -> Float[AnyArray, "first second third wavelength"]:
     """Return node values of a sum of modes."""
     for place, axis in enumerate(axes):
         amplitude = array_module(amplitude).tensordot(axis.modes, amplitude, (1, place))

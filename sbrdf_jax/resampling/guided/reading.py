@@ -4,15 +4,18 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg.blas
 from jaxtyping import Float
 
 from sbrdf_jax.devices import on_host
 from sbrdf_jax.grid import Grid
-from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.records import GriddedBRDF
 from sbrdf_jax.resampling.guided.covariance import covariance_on_axes
-from sbrdf_jax.resampling.guided.field import GuidedField, evaluate_on_axes_with_error, evaluated_part
+from sbrdf_jax.resampling.guided.field import (
+    GuidedField,
+    evaluate_on_axes_with_error,
+    evaluated_part,
+    unexplained,
+)
 from sbrdf_jax.resampling.guided.lanes import take_field
 from sbrdf_jax.resampling.guided.on_axes import on_axes
 
@@ -97,14 +100,14 @@ def _add_variances(
     for i in rows:
         pending.append(on_axes(functools.partial(on_host(covariance_on_axes), *prior, theta_i[i]), *axes, distinct[i]))
         if sum(len(part[1]) for part in pending) >= MOST_PENDING:
-            flushed.append(_unexplained(pending, whiten))
+            flushed.append(unexplained(*_joined(pending), whiten))
             pending = []
     if pending:
+        cross, prior_alone = _joined(pending)
         if not flushed:
             covariances.clear()  # they take up to 52 MB
-            covariances[key] = tuple(np.concatenate(arrays) for arrays in zip(*pending, strict=True))
-            pending = [covariances[key]]
-        flushed.append(_unexplained(pending, whiten))
+            covariances[key] = cross, prior_alone
+        flushed.append(unexplained(cross, prior_alone, whiten))
     if flushed:
         found = np.full(variance.shape, np.nan)
         found[distinct] = np.concatenate(flushed)
@@ -112,12 +115,11 @@ def _add_variances(
         variance[missing] = found[missing]
 
 
-def _unexplained(parts: list[Covariances], whiten: np.ndarray) -> np.ndarray:
-    """`field.unexplained` of covariances and prior variances, on the host: BLAS multiplies by a triangle as such."""
+def _joined(parts: list[Covariances]) -> Covariances:
+    if len(parts) == 1:
+        return parts[0]
     cross, prior = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    with one_blas_thread():
-        explained = scipy.linalg.blas.dtrmm(1.0, whiten, cross.T, lower=1, overwrite_b=1)
-    return np.maximum(prior - np.einsum("cd,cd->d", explained, explained), 0.0)
+    return cross, prior
 
 
 def _take_known(value, variance, half: np.ndarray, grid: Grid, wavelength_nm: np.ndarray, known: GriddedBRDF):

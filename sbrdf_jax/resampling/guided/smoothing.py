@@ -4,6 +4,7 @@ A field is read between measured directions of a measured incident angle and bet
 incident angles: what is best for the one alone can be poor for the other.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -15,9 +16,10 @@ from sbrdf_jax.resampling.guided.nodes import ModeVariance, Term, mode_variance
 CONSTANT = 1e-2  # variance of a constant, relative to the half-angle term's
 PRIOR = (
     Term("half", 1.5, 1.0, (3.0, 1.5, 1.0)),
-    Term("azimuth", 0.5, 0.3, (10.0, 3.3, 3.3)),
-    Term("half", 0.5, 0.04, (3.0, 0.5, 1.0)),
-    Term("azimuth", 0.5, 0.02, (3.0, 0.8, 1.0)),
+    Term("azimuth", 0.5, 0.18, (10.0, 3.3, 3.3)),
+    Term("half", 0.5, 0.02, (3.0, 0.5, 1.0)),
+    Term("difference", math.inf, 0.006, (1.2, 0.6, 0.09)),
+    Term("difference", math.inf, 0.002, (0.4, 0.2, 0.03)),
 )
 NOISE_LADDER = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1, 3e-1)  # noise variance relative to the half-angle term's
 FIRST_NOISE = 3e-3
