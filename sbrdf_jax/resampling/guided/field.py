@@ -31,7 +31,7 @@ from sbrdf_jax.resampling.guided.covariance import (
 from sbrdf_jax.resampling.guided.error_model import ResidualScale, residual_scale
 from sbrdf_jax.resampling.guided.inverse import whitener
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
-from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, cubic_matrix, cubic_weights, interpolate
+from sbrdf_jax.resampling.guided.nodes import GRIDS, THETA, ModeVariance, cubic_matrix, cubic_weights, interpolate
 
 DIRECTIONS_AT_A_TIME = 1024
 WHITEN_BLOCK = 256  # rows of a triangular matrix that are multiplied as one full block
@@ -229,11 +229,11 @@ def _log_value_on_axes(field: GuidedField, theta_i, theta_o, phi_o) -> tuple[Coo
     """Coordinates and z; nodes are summed over both polar angles once for all azimuths."""
     at = coordinates_on_axes(theta_i, theta_o, phi_o, field.theta_limit)
     z = lobe_log_value(field.lobe, at, field.floor)
-    for name, (axis, axis_i, axis_o) in GRIDS.items():
+    first, weight = cubic_weights(at.theta_i[0], THETA)
+    along_o = cubic_matrix(at.theta_o[:, 0], THETA)
+    for name, (axis, _, _) in GRIDS.items():
         xp, nodes = array_module(z), getattr(field, name)
-        first, weight = cubic_weights(at.theta_i[0, :1], axis_i)
         around = nodes[:, first[0] : first[0] + 4] if xp is np else jax.lax.dynamic_slice_in_dim(nodes, first[0], 4, 1)
-        nodes = sum(weight[0, k] * around[:, k] for k in range(4))
-        nodes = cubic_matrix(at.theta_o[:, 0], axis_o)[None] @ nodes  # [first node, o, wavelength]
+        nodes = along_o[None] @ sum(weight[0, k] * around[:, k] for k in range(4))  # [first node, o, wavelength]
         z = z + cubic_matrix(getattr(at, name), axis) @ xp.swapaxes(nodes, 0, 1)
     return at, z
