@@ -81,7 +81,7 @@ class Kept:
 
 
 def _key(arrays: list[Any]) -> str:
-    digest = hashlib.sha256()
+    digest = hashlib.blake2b()  # as safe as SHA-256, in half of the time
     for array in map(np.asarray, arrays):
         digest.update(f"{array.shape}{array.dtype}".encode())
         digest.update(np.ascontiguousarray(array).data)
