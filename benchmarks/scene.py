@@ -60,7 +60,7 @@ def measure(file: str, repeats: int) -> list[dict[str, Any]]:
             start = time.perf_counter()
             raw = read(options.input.path, options.input)
             with Progress(folder / "log", quiet=True) as progress:
-                result = process(raw, prepare(raw, options), options, progress, kept)
+                result = process(raw, prepare(raw, options, kept), options, progress, kept)
             return result, time.perf_counter() - start
 
         options = resolve(parse_config(f"input: {{path: '{file}'}}"))

@@ -6,6 +6,7 @@ decides how well a short periodic Fourier series can carry it.
 """
 
 import dataclasses
+import functools
 import hashlib
 
 import numpy as np
@@ -149,13 +150,8 @@ def measure(name: str, seed: int = 0, count: int | None = None, noise: float | i
     if not (np.isfinite(noise) and noise >= 0):
         raise UserError(f"noise: found {noise}, expected a factor of 0 or more")
 
-    lattice_rng, noise_rng = (np.random.default_rng([seed, stream]) for stream in (0, 1))
-    parts = []
-    for angle in np.radians(THETA_I_DEG):
-        theta_o, phi_o = _jittered_directions(angle, count, lattice_rng)
-        parts.append((np.full(len(theta_o), angle), theta_o, phi_o))
-    theta_i, theta_o, phi_o = (np.concatenate(part) for part in zip(*parts, strict=True))
-
+    noise_rng = np.random.default_rng([seed, 1])
+    theta_i, theta_o, phi_o = _directions(seed, count).copy()
     value = true_brdf(name, theta_i, theta_o, phi_o, WAVELENGTH_NM)
     per_sample = noise_rng.standard_normal((len(theta_i), 1))
     value = value * (1 + noise * 0.010 * (per_sample + noise_rng.standard_normal(value.shape)))
@@ -178,6 +174,16 @@ def measure(name: str, seed: int = 0, count: int | None = None, noise: float | i
         source_sha256=digest.hexdigest(),
         notes=(f"simulated measurement, seed {seed}, noise factor {noise:g}",),
     )
+
+
+@functools.lru_cache(maxsize=2)
+def _directions(seed: int, count: int) -> Float[np.ndarray, "3 sample"]:
+    """Return theta_i, theta_o and phi_o [rad] of a whole measurement; most of the time that one takes."""
+    rng, parts = np.random.default_rng([seed, 0]), []
+    for angle in np.radians(THETA_I_DEG):
+        theta_o, phi_o = _jittered_directions(angle, count, rng)
+        parts.append(np.stack([np.full(len(theta_o), angle), theta_o, phi_o]))
+    return np.concatenate(parts, axis=1)
 
 
 def _jittered_directions(theta_i: float, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

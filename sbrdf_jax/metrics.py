@@ -21,7 +21,7 @@ from sbrdf_jax.grid import midpoints
 from sbrdf_jax.needs import restrict_theta_i
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, SpectralBasis, SpectralField
 from sbrdf_jax.representation import lobe_harmonics, lobe_tensor
-from sbrdf_jax.representation.half_field import cells_between
+from sbrdf_jax.representation.half_field import HalfField, cells_between
 from sbrdf_jax.representation.paper import compact_coefficient
 from sbrdf_jax.representation.target import PAPER_DIRECTIONS
 
@@ -54,6 +54,7 @@ def measure(
     *,
     absolute: bool = True,
     matching: colour.ColourMatching | None = None,
+    half: HalfField | None = None,
     seed: int = 0,
 ) -> Metrics:
     """Measure the grid, and the compact form against it.
@@ -64,6 +65,7 @@ def measure(
         compact: Its compact form, of the wavelengths that are finite; without it only the grid is measured.
         absolute: False where values are only proportional to a BRDF: albedo then warns of nothing.
         matching: Colours of the grid's wavelengths, where they are not those of all that was measured.
+        half: What the compact form was fitted to, where it holds the grid stage between the nodes.
         seed: Of the random directions.
 
     Returns:
@@ -72,7 +74,7 @@ def measure(
     """
     value, warnings = measure_grid(gridded, absolute=absolute, seed=seed)
     if compact is not None:
-        value |= error_between(compact, gridded) | compression(compact)
+        value |= error_between(compact, gridded, half) | compression(compact)
         live = live_wavelengths(gridded)
         if matching is None:
             matching = colour.colour_matching(np.asarray(gridded.wavelength_nm)[live])
@@ -187,20 +189,32 @@ def whole_hemispheres(gridded: GriddedBRDF) -> Bool[np.ndarray, " theta_i"]:
     return needed_nodes(gridded).all(axis=(1, 2))
 
 
-def error_between(compact: CompactBRDF | LobeHarmonics | LobeTensor, gridded: GriddedBRDF) -> dict:
+def error_between(
+    compact: CompactBRDF | LobeHarmonics | LobeTensor, gridded: GriddedBRDF, half: HalfField | None = None
+) -> dict:
     """Eq. (18) at cell midpoints of theta_o and phi_o, against the grid stage there; and with theta_i midway too.
 
     Midpoints count whose neighbours are all needed; it is nan where there are none, and midway between
-    incident angles where the grid interpolates nothing over them.
+    incident angles where the grid interpolates nothing over them. What `half` holds of the grid stage is not
+    evaluated again.
     """
     theta_i = np.asarray(gridded.theta_i)
     theta_o, phi_o = midpoints(gridded.theta_o), midpoints(gridded.phi_o)
     live, cell = live_wavelengths(gridded), cells_between(needed_nodes(gridded))
 
+    known = half.blocks[1:] if half is not None and half.is_field and live.all() else ()
+
+    def grid_at(theta_i, cells):
+        for block in known:
+            if np.array_equal(block.theta_i, theta_i):
+                twin = np.minimum(np.arange(len(phi_o)), np.arange(len(phi_o))[::-1])
+                return (value[:, twin][cell] for value, cell in zip(block.brdf, cells, strict=True) if cell.any())
+        counts = cells.any(axis=(1, 2))
+        return (value[:, live] for value in slices(gridded, theta_i[counts], theta_o, phi_o, cells[counts]))
+
     def at(theta_i, cells):
         errors, counts = np.full(len(cells), np.nan), cells.any(axis=(1, 2))
-        given = theta_i[counts], theta_o, phi_o, cells[counts]
-        wanted = (value[:, live] for value in slices(gridded, *given))
+        given, wanted = (theta_i[counts], theta_o, phi_o, cells[counts]), grid_at(theta_i, cells)
         pairs = zip(wanted, slices(compact, *given), strict=True)
         errors[counts] = [relative_error(((got - want) ** 2).sum(), (want**2).sum()) for want, got in pairs]
         return errors

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from sbrdf_jax.cleaning import CleanResult, clean
+from sbrdf_jax.cleaning import CleanResult
 from sbrdf_jax.compact_layout import stored_bytes
 from sbrdf_jax.encoding import coefficients_allowed, data_basis, encode_field, make_basis
 from sbrdf_jax.folds import LEAVE_ONE_OUT, Folds, make_folds
@@ -48,12 +48,13 @@ class Prepared:
     earlier: Earlier | None = None  # a result whose parts may be reused
 
 
-def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
+def prepare(raw: RawSamples, options: RunOptions, kept: Kept | None = None) -> Prepared:
     """Clean a measurement, lay out its grid and count the work.
 
     Args:
         raw: All rows of a file.
         options: Resolved options.
+        kept: As for `process`.
 
     Returns:
         The cleaned samples, the grid, the plan, and what a user must be told.
@@ -61,7 +62,7 @@ def prepare(raw: RawSamples, options: RunOptions) -> Prepared:
     Raises:
         UserError: The measurement is not enough for a grid or for its validation, or the fold file is wrong.
     """
-    cleaned = clean(raw, bilateral=options.input.bilateral, method=options.resample.method)
+    cleaned = (kept or Kept()).cleaned(raw, options.input.bilateral, options.resample.method)
     grid = make_grid(cleaned.samples, options.grid, bilateral=cleaned.report.bilateral)
     needs, quadrature = find_needs(options, grid, raw.wavelength_nm), None
     if options.scene is not None and options.scene.colour is not None:
@@ -131,10 +132,11 @@ def process(
         budget = None if options.scene is None else options.scene.error_budget
         compact, searched = represent_with_plan(part, options.represent, live, matching, budget)
         missed, rounding = tuple(searched.pop("warnings", ())), searched.pop("storage_error")
+        half = searched.pop("half_field", None)
         progress.update(count_statuses(compact.status))
 
     with _timed(progress, timing, "measure"), one_blas_thread():
-        metrics = measure(gridded, field, compact, absolute=raw.quantity == "brdf", matching=matching)
+        metrics = measure(gridded, field, compact, absolute=raw.quantity == "brdf", matching=matching, half=half)
         metrics.value.update(storage_scores(compact, rounding, gridded))
 
     validation = {}

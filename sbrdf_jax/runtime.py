@@ -1,13 +1,15 @@
 """Process-wide settings of JAX, made once by the entry points and never by library modules."""
 
 import contextlib
+import ctypes
 import dataclasses
-import importlib
+import functools
 import os
-import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 
 CACHE_VARIABLE = "SBRDF_COMPILE_CACHE"
+HELD_MEMORY = {-3: 2**25, -1: 2**27}  # bytes by glibc's M_MMAP_THRESHOLD, as large as it may be, and M_TRIM_THRESHOLD
 
 
 @dataclasses.dataclass(eq=False)  # two clocks of equal seconds are two
@@ -64,6 +66,7 @@ def set_up_jax() -> None:
     """
     import jax
 
+    keep_freed_memory()
     jax.config.update("jax_enable_x64", True)
     folder = os.environ.get(CACHE_VARIABLE)
     if folder:
@@ -72,9 +75,15 @@ def set_up_jax() -> None:
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
-def import_ahead(*modules: str) -> None:
-    """Import modules that are needed later while XLA compiles, for which it leaves the interpreter free."""
-    threading.Thread(target=lambda: [importlib.import_module(name) for name in modules]).start()
+def keep_freed_memory() -> None:
+    """Let glibc hold what NumPy's arrays free for the next ones; without it a tenth of a run goes into page faults.
+
+    Other C libraries are left as they are.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        for option, size in HELD_MEMORY.items():
+            mallopt(option, size)
 
 
 def require_float64() -> None:
@@ -95,13 +104,14 @@ def require_float64() -> None:
         )
 
 
-def versions() -> dict[str, str]:
+@functools.cache
+def versions() -> Mapping[str, str]:
     """Versions of what computes and stores a result."""
     import platform
     from importlib.metadata import version
 
     packages = ("sbrdf-jax", "jax", "jaxlib", "numpy", "scipy", "h5py", "optimistix", "jaxopt", "colour-science")
-    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+    return MappingProxyType({"python": platform.python_version()} | {name: version(name) for name in packages})
 
 
 def _listen() -> None:

@@ -171,7 +171,10 @@ def test_covariance_and_nodes_equal_dense_matrices(rng, reciprocal):
     theta_o, phi_o = jnp.asarray([0.0, 0.4, 1.2]), jnp.asarray([0.0, 1.0, np.pi])
     limit, centre = jnp.asarray(centres.theta_limit), jnp.asarray(centres.angles.reshape(3, 3, -1))
     along, along_prior = covariance_on_axes(variance, centre, limit, jnp.asarray(0.3), theta_o, phi_o)
-    mesh = coordinates_on_axes(jnp.asarray(0.3), theta_o, phi_o, limit)
+    mesh = guided_coordinates(jnp.full((3, 3), 0.3), *jnp.meshgrid(theta_o, phi_o, indexing="ij"), limit)
+    on_axes = coordinates_on_axes(jnp.asarray(0.3), theta_o, phi_o, limit)
+    for part, whole in zip(jax.tree.leaves(on_axes), jax.tree.leaves(mesh), strict=True):
+        np.testing.assert_allclose(jnp.broadcast_to(part, (3, 3)), whole, rtol=1e-12)
     np.testing.assert_allclose(
         along.reshape(9, -1), covariance(variance, flatten(mesh), centres.features), rtol=1e-10, atol=1e-14
     )

@@ -10,16 +10,19 @@ from scipy.interpolate import RegularGridInterpolator
 
 from sbrdf_jax.cli import main
 from sbrdf_jax.config import parse_config, resolve
+from sbrdf_jax.encoding import encode_field, make_basis
 from sbrdf_jax.evaluation import evaluate_in_chunks
 from sbrdf_jax.formats import write_samples
 from sbrdf_jax.grid import make_grid
 from sbrdf_jax.masks import write_footprint
+from sbrdf_jax.metrics import error_between
 from sbrdf_jax.needs import Needs, everything
-from sbrdf_jax.options import GridOptions, ResampleOptions, RunOptions
+from sbrdf_jax.options import GridOptions, RepresentOptions, ResampleOptions, RunOptions
 from sbrdf_jax.pipeline import prepare, process
 from sbrdf_jax.plan import EQUAL
 from sbrdf_jax.progress import Progress
 from sbrdf_jax.records import RawSamples
+from sbrdf_jax.representation import represent_with_plan
 from sbrdf_jax.resampling import resample
 from sbrdf_jax.resampling.kept import Kept
 from sbrdf_jax.scene import find_needs
@@ -72,6 +75,26 @@ def some_nm(samples) -> list[float]:
 
 def options_of(*overrides: str) -> RunOptions:
     return resolve(parse_config("input: {path: 'builtin:amber_glass'}", [*GRID, *overrides]))
+
+
+def test_a_measurement_is_cleaned_once(samples):
+    kept, changed = Kept(), dataclasses.replace(samples, value=2 * samples.value)
+    first = kept.cleaned(samples, "auto", "guided")
+    assert kept.cleaned(dataclasses.replace(samples, value=samples.value.copy()), "auto", "guided") is first
+    for other in (kept.cleaned(samples, "auto", "paper"), kept.cleaned(changed, "auto", "guided")):
+        assert other is not first
+    np.testing.assert_array_equal(kept.cleaned(changed, "auto", "guided").samples.value, changed.value)
+
+
+def test_what_a_fit_knows_of_the_grid_between_its_nodes_is_not_evaluated_again(full, monkeypatch):
+    compact, plan = represent_with_plan(
+        encode_field(full, make_basis(np.asarray(full.wavelength_nm), "cosine", 5)), RepresentOptions(), full
+    )
+    expected = error_between(compact, full)
+    monkeypatch.setattr("sbrdf_jax.evaluation.evaluate_directions", None)
+    monkeypatch.setattr("sbrdf_jax.evaluation.field_on_axes", None)
+    for name, value in error_between(compact, full, plan["half_field"]).items():
+        np.testing.assert_allclose(value, expected[name], rtol=1e-12)
 
 
 def random_needs(rng, grid, number: int) -> Needs:

@@ -83,7 +83,7 @@ def compute_material(material: Material) -> None:
     ):
         try:
             raw = read(options.input.path, options.input)
-            ready = prepare(raw, options)
+            ready = prepare(raw, options, _this_thread.kept)
             run_to_file(raw, ready, options, progress, time.perf_counter() - start, _this_thread.kept)
         except Exception:
             for line in traceback.format_exc().splitlines():

@@ -112,15 +112,17 @@ def check_result(path: Path) -> Checked:
     failed, worst, seconds = 0, np.nan, {"total": 0.0, "compile": 0.0}
     with open_result(path) as file:
 
-        def visit(name: str, item: Any) -> None:
+        def visit(path: bytes) -> None:
             nonlocal failed, worst
-            if not isinstance(item, h5py.Dataset):
+            item, name = h5py.h5o.open(file.id, path), path.decode()  # in half of the time of `visititems`
+            if not isinstance(item, h5py.h5d.DatasetID):
                 return
-            value = item[()]
+            value = np.empty(item.shape, item.dtype)
+            item.read(h5py.h5s.ALL, h5py.h5s.ALL, value)
             group, last = name.split("/")[0], name.split("/")[-1]
-            is_plain = "exponent" not in item.attrs  # else the numbers of each material count in their own units
+            is_plain = not h5py.h5a.exists(item, b"exponent")  # else a material's numbers count in their own units
             if group in STACKED and item.dtype.kind in "biuf" and is_plain:
-                layout[name] = (list(np.shape(value)), item.dtype.str)
+                layout[name] = (list(item.shape), item.dtype.str)
             if last == "status":
                 failed += int(np.isin(value, _FAILED).sum())
             if name == "metrics/relative_error":
@@ -128,7 +130,7 @@ def check_result(path: Path) -> Checked:
             if group == "timing" and last in seconds:
                 seconds[last] += float(value)
 
-        file.visititems(visit)
+        h5py.h5o.visit(file.id, visit)
         return Checked(
             config=_stored_key(_PATH_LINE.sub("  path: any", str(attribute(file, "config")))),
             source=str(attribute(file, "source_sha256")),

@@ -1,11 +1,12 @@
-"""What a lobe tensor is fitted to: a field on one side of the plane of incidence, at its nodes and between them."""
+"""What a lobe tensor is fitted to: a field on one side of the plane of incidence, at its nodes and between them.
+
+SciPy's interpolation and images take half a second to import, and few runs need them: functions import them.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.interpolate import PchipInterpolator
-from scipy.ndimage import distance_transform_edt
 
 from sbrdf_jax.evaluation import evaluate_where
 from sbrdf_jax.grid import has_data, midpoints
@@ -138,6 +139,8 @@ def _filled(brdf: np.ndarray, needed: Bool[np.ndarray, "i o p"]) -> np.ndarray:
     """Give what is skipped the value of the nearest direction of its incident angle that is needed."""
     if needed.all():
         return brdf
+    from scipy.ndimage import distance_transform_edt
+
     filled = brdf.copy()
     for value, mask in zip(filled, needed, strict=True):
         if mask.any() and not mask.all():
@@ -156,6 +159,8 @@ def _logarithm(nodes: Block):
 
 def _interpolate_logarithm(nodes: Block, theta_o, phi_o):
     """Interpolate nodes by monotone cubics through their logarithms: in theta_o, then in phi_o."""
+    from scipy.interpolate import PchipInterpolator
+
     value = PchipInterpolator(nodes.theta_o, _logarithm(nodes), axis=1)(theta_o)
     return np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))
 
@@ -166,6 +171,8 @@ def _along_mirror_track(nodes: Block, phi_o) -> tuple[np.ndarray, np.ndarray]:
     theta_o moves with theta_i from neighbour to neighbour, so a peak that moves with its mirror
     direction stays one peak. Where one of the outer two does not exist, the inner two alone.
     """
+    from scipy.interpolate import PchipInterpolator
+
     step, last, slack = np.diff(nodes.theta_i).mean(), nodes.theta_o[-1], 1e-9
     first = nodes.theta_o[nodes.theta_o + step <= last + slack]
     along = PchipInterpolator(nodes.theta_o, _logarithm(nodes), axis=1)

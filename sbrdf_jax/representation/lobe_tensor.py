@@ -74,7 +74,8 @@ def represent(
         budget: An error that is enough, where the target asks for less or for another thing.
 
     Returns:
-        The tensor, and a plan: ranks, what was promised and what was measured, `warnings`.
+        The tensor, and a plan: ranks, what was promised and what was measured, `warnings`, and `half_field`, what it
+        was fitted to.
 
     Numerics:
         Least squares of the values themselves; the clip at 0 comes last and lowers the error of a
@@ -119,7 +120,7 @@ def represent(
         half_angle_floor=floor,
         interpolate_theta_i=field.interpolate_theta_i,
     )
-    plan = {"method": "lobe_tensor", "ranks": np.array(np.shape(tensor.core))}
+    plan = {"method": "lobe_tensor", "ranks": np.array(np.shape(tensor.core)), "half_field": half}
     return tensor, plan | make_plan(target, achieved, half)
 
 

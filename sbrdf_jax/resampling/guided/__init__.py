@@ -7,7 +7,6 @@ grids, for all wavelengths at once; everything that depends on angles alone is s
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sbrdf_jax.grid import Grid
@@ -136,20 +135,20 @@ def resample_guided(
     nodes = read_nodes(fit.field, grid, fit.whiten, needs.node, known, *held)
     theta_i = needs.theta_i
     return GriddedBRDF(
-        theta_i=jnp.asarray(grid.theta_i[theta_i]),
-        theta_o=jnp.asarray(grid.theta_o),
-        phi_o=jnp.asarray(grid.phi_o),
-        wavelength_nm=jnp.asarray(samples.wavelength_nm[needs.wavelength]),
-        brdf=jnp.asarray(nodes.value),
-        extrapolated=jnp.asarray(extrapolated_nodes(samples, grid)[theta_i]),
-        kkt_residual=jnp.asarray(fit.kkt_residual),
-        num_steps=jnp.asarray(fit.num_steps),
-        status=jnp.asarray(fit.status),
+        theta_i=grid.theta_i[theta_i],
+        theta_o=grid.theta_o,
+        phi_o=grid.phi_o,
+        wavelength_nm=samples.wavelength_nm[needs.wavelength],
+        brdf=nodes.value,
+        extrapolated=extrapolated_nodes(samples, grid)[theta_i],
+        kkt_residual=fit.kkt_residual,
+        num_steps=fit.num_steps,
+        status=fit.status,
         method="guided",
         window=options.window,
         bilateral=True,
         interpolate_theta_i=grid.interpolate_theta_i,
-        standard_error=jnp.asarray(nodes.standard_error),
+        standard_error=nodes.standard_error,
         residual_variance=nodes.variance,
         field=fit.field,
         needed=None if needs.node[theta_i].all() else needs.node[theta_i],

@@ -53,14 +53,15 @@ def solve_bounded(
     is_bound = noise < PADDING_NOISE
     root = np.where(is_bound, np.sqrt(noise), 0.0)
     with one_blas_thread():
-        unbounded = model + residual - (root**2)[:, None] * (inverse @ residual)
+        raised, dual = residual, inverse @ residual
+        unbounded = model + residual - (root**2)[:, None] * dual
         found = NNLSResult(np.zeros_like(residual), *np.zeros((2, lanes), int), np.zeros(lanes))
         if not np.all(unbounded[is_bound] >= 0):
             covariance = np.eye(len(root)) - root[:, None] * inverse * root[None, :]
             rhs = np.where(is_bound[:, None], -unbounded / np.where(is_bound, root, 1.0)[:, None], 0.0)
             found = NNLSResult(*map(np.asarray, _solve_lanes(covariance, rhs, method)))
-        raised = residual + root[:, None] * found.value
-        dual = inverse @ raised
+            raised = residual + root[:, None] * found.value
+            dual = inverse @ raised
         # what the linear system is left with, beside what the bound is left with
         misfit = np.abs(prior @ dual + noise[:, None] * dual - raised).max(axis=0)
     size = np.abs(raised).max(axis=0)

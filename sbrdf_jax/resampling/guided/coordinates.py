@@ -24,7 +24,7 @@ LARGEST_Z = 80.0  # an exponential of more would be of no use to anyone
 
 @pytree()
 class Coordinates:
-    """Directions as the guided method sees them; all of one shape."""
+    """Directions as the guided method sees them; the polar angles have the shapes that they came with."""
 
     half: Any  # log(theta_h [deg] + 1)
     azimuth: Any  # rad, folded to [0, pi], pi / 2 at the poles
@@ -37,12 +37,12 @@ class Coordinates:
 
 
 def guided_coordinates(
-    theta_i: Float[AnyArray, "*shape"],
-    theta_o: Float[AnyArray, "*shape"],
-    phi_o: Float[AnyArray, "*shape"],
+    theta_i: Float[AnyArray, "*#shape"],
+    theta_o: Float[AnyArray, "*#shape"],
+    phi_o: Float[AnyArray, "*#shape"],
     theta_limit: Float[AnyArray, " 2"],
 ) -> Coordinates:
-    """Return the guided method's coordinates of directions.
+    """Return the guided method's coordinates of directions, whose angles broadcast.
 
     theta_h comes from atan2 of the tangential and the normal part of the sum of both
     directions: mirror samples have theta_h near 0.1 degrees, where arccos has no digits.
@@ -81,10 +81,8 @@ def guided_coordinates(
 def coordinates_on_axes(
     theta_i: Float[AnyArray, ""], theta_o: Float[AnyArray, " o"], phi_o: Float[AnyArray, " p"], theta_limit
 ):
-    """`guided_coordinates` [o, p] of all combinations of two axes, at one incident angle."""
-    xp = array_module(theta_i, theta_o, phi_o, theta_limit)
-    theta_o, phi_o = xp.meshgrid(theta_o, phi_o, indexing="ij")
-    return guided_coordinates(xp.broadcast_to(theta_i, theta_o.shape), theta_o, phi_o, theta_limit)
+    """`guided_coordinates` [o, p] of all combinations of two axes, at one incident angle, [1, 1]; theta_o [o, 1]."""
+    return guided_coordinates(theta_i.reshape(1, 1), theta_o[:, None], phi_o[None, :], theta_limit)
 
 
 def exchanged(at: Coordinates) -> Coordinates:
@@ -108,7 +106,7 @@ def log_scale(at: Coordinates, floor: Float[AnyArray, ""] | float) -> Float[AnyA
 
 
 def to_log(
-    value: Float[AnyArray, "*shape wavelength"], scale: Float[AnyArray, "*shape"]
+    value: Float[AnyArray, "*#shape wavelength"], scale: Float[AnyArray, "*#shape"]
 ) -> Float[AnyArray, "*shape wavelength"]:
     """Generalised logarithm z = log(1 + value scale): relative above the floor, absolute below.
 
@@ -119,7 +117,7 @@ def to_log(
 
 
 def from_log(
-    z: Float[AnyArray, "*shape wavelength"], scale: Float[AnyArray, "*shape"]
+    z: Float[AnyArray, "*#shape wavelength"], scale: Float[AnyArray, "*#shape"]
 ) -> Float[AnyArray, "*shape wavelength"]:
     """Inverse of `to_log`; never negative, because a z below 0 counts as 0."""
     xp = array_module(z, scale)
@@ -127,7 +125,7 @@ def from_log(
 
 
 def slope(
-    z: Float[AnyArray, "*shape wavelength"], scale: Float[AnyArray, "*shape"]
+    z: Float[AnyArray, "*#shape wavelength"], scale: Float[AnyArray, "*#shape"]
 ) -> Float[AnyArray, "*shape wavelength"]:
     """Derivative of `from_log` by z [1/sr]; where z is below 0, that at 0."""
     xp = array_module(z, scale)

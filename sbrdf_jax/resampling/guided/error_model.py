@@ -132,7 +132,7 @@ def fit_residual_scale(
 
 def residual_scale(
     scale: ResidualScale,
-    theta_i: Float[AnyArray, "*direction"],
+    theta_i: Float[AnyArray, "*#direction"],
     half: Float[AnyArray, "*direction"],
     z: Float[AnyArray, "*direction wavelength"],
 ) -> Float[AnyArray, "*direction wavelength"]:

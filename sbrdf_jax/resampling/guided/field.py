@@ -39,6 +39,7 @@ from sbrdf_jax.resampling.guided.nodes import (
     HALF,
     LEAN,
     POLAR_GRIDS,
+    THETA,
     ModeVariance,
     cubic_matrix,
     cubic_rows,
@@ -247,12 +248,12 @@ def _log_value_on_axes(field: GuidedField, theta_i, theta_o, phi_o) -> tuple[Coo
     at = coordinates_on_axes(theta_i, theta_o, phi_o, field.theta_limit)
     z = lobe_log_value(field.lobe, at, field.floor)
     z = z + _difference_on_axes(field.difference, at)
-    for name, (_, (axis, axis_i, axis_o)) in POLAR_GRIDS.items():
+    first, weight = cubic_weights(at.theta_i[0], THETA)
+    along_o = cubic_matrix(at.theta_o[:, 0], THETA)
+    for name, (_, (axis, _, _)) in POLAR_GRIDS.items():
         xp, nodes = array_module(z), getattr(field, name)
-        first, weight = cubic_weights(at.theta_i[0, :1], axis_i)
         around = nodes[:, first[0] : first[0] + 4] if xp is np else jax.lax.dynamic_slice_in_dim(nodes, first[0], 4, 1)
-        nodes = sum(weight[0, k] * around[:, k] for k in range(4))
-        nodes = cubic_matrix(at.theta_o[:, 0], axis_o)[None] @ nodes  # [first node, o, wavelength]
+        nodes = along_o[None] @ sum(weight[0, k] * around[:, k] for k in range(4))  # [first node, o, wavelength]
         z = z + cubic_matrix(getattr(at, name), axis) @ xp.swapaxes(nodes, 0, 1)
     return at, z
 

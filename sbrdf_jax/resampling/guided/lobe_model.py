@@ -59,12 +59,10 @@ def lobe_terms(shape: Float[AnyArray, " 9"], at: Coordinates, mirror_power: floa
     diffuse = (1 - fresnel(cos_i, index)) * (1 - fresnel(cos_o, index))
     steep = xp.minimum((at.tan2_half / width[0] ** 2) ** mirror_power, HIGHEST_EXPONENT)
     mirror = xp.exp(log_fresnel - steep) * (cos_i * cos_o) ** -shape[8]
-    terms = [diffuse, mirror]
+    terms, spread = [xp.broadcast_to(diffuse, mirror.shape), mirror], 2 * xp.log1p(at.tan2_half)
     for k, fresnel_power, shadowing_power in ((1, shape[4], shape[5]), (2, shape[6], shape[7])):
-        shadowing = xp.zeros_like(cos_i)
-        for cos in (cos_i, cos_o):
-            shadowing = shadowing + log_shadowing(width[k], cos)
-        falloff = 2 * xp.log1p(at.tan2_half) - 2 * xp.log1p(at.tan2_half / width[k] ** 2)
+        shadowing = log_shadowing(width[k], cos_i) + log_shadowing(width[k], cos_o)
+        falloff = spread - 2 * xp.log1p(at.tan2_half / width[k] ** 2)
         terms.append(xp.exp(fresnel_power * log_fresnel + shadowing_power * shadowing + falloff))
     return xp.stack(terms, axis=-1)
 

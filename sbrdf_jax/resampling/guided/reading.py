@@ -78,8 +78,8 @@ def read_nodes(
                 out[o, p, columns] = new
     around, rows = np.append(grid.azimuth_index, 0), half.any(axis=(1, 2))
     known_variance = np.where(half, variance, np.nan)[rows][:, :, around]
-    value = value[:, rows][:, :, :, around]
-    return NodeValues(value[0], value[1], known_variance)
+    nodes, errors = (np.ascontiguousarray(part[rows][:, :, around]) for part in value)  # products round by the order
+    return NodeValues(nodes, errors, known_variance)
 
 
 def _add_variances(
