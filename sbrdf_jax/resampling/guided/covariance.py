@@ -29,6 +29,7 @@ from sbrdf_jax.resampling.guided.nodes import (
     Features,
     ModeVariance,
     axis_features,
+    difference_features,
     features_of,
     synthesise,
 )
@@ -175,7 +176,7 @@ def covariance_on_axes(
         of_centre = of_group @ xp.swapaxes(centre_o, 1, 2)[:, None] * xp.swapaxes(at_centre, 1, 2)[:, None]
         total = total + around[None] @ of_centre  # [group, o, p, member]
     total = xp.moveaxis(total, 0, 2).reshape(*at.half.shape, -1)
-    return total + _along_axes(variance, along, group_features(places).along), prior
+    return total + _along_axes(variance, along, difference_features(flatten(places))), prior
 
 
 def mode_sums(

@@ -34,10 +34,7 @@ from sbrdf_jax.resampling.guided.error_model import ResidualScale, residual_scal
 from sbrdf_jax.resampling.guided.inverse import whitener
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
 from sbrdf_jax.resampling.guided.nodes import (
-    DIFFERENCE,
     GRIDS,
-    HALF,
-    LEAN,
     POLAR_GRIDS,
     THETA,
     ModeVariance,
@@ -259,12 +256,11 @@ def _log_value_on_axes(field: GuidedField, theta_i, theta_o, phi_o) -> tuple[Coo
 
 
 def _difference_on_axes(nodes, at: Coordinates) -> AnyArray:
-    """What the difference grid adds [o, p, wavelength]; its first coordinate is the same for all azimuths."""
-    xp = array_module(nodes, at.lean)
-    of_lean = xp.tensordot(cubic_matrix(at.lean[:, 0], LEAN), nodes, (1, 0))  # [o, half, difference, wavelength]
+    """What the difference grid adds [o, p, wavelength]: direction by direction, it has no axis along theta_o."""
+    grid, xp = GRIDS["difference"], array_module(nodes, at.half)
+    places = tuple(xp.broadcast_to(x, at.half.shape).reshape(-1) for x in grid.places(at))
     if xp is np:
-        flat = of_lean.reshape(len(of_lean), -1, nodes.shape[-1])
-        rows = cubic_rows((at.half.ravel(), at.difference.ravel()), (HALF, DIFFERENCE), blocks=len(flat))
-        return (rows @ flat.reshape(-1, nodes.shape[-1])).reshape(*at.half.shape, -1)
-    halfway = jnp.einsum("oph,ohdw->opdw", cubic_matrix(at.half, HALF), of_lean)
-    return jnp.einsum("opd,opdw->opw", cubic_matrix(at.difference, DIFFERENCE), halfway)
+        found = cubic_rows(places, grid.axes) @ nodes.reshape(-1, nodes.shape[-1])
+    else:
+        found = jax.vmap(lambda place: interpolate(nodes, place, grid.axes))(places)
+    return found.reshape(*at.half.shape, -1)

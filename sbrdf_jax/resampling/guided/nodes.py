@@ -188,23 +188,17 @@ def cubic_matrix(x: Float[AnyArray, "*shape"], axis: Axis) -> Float[AnyArray, "*
     return jnp.where(_four(first)[..., None] == nodes, weight[..., None], 0.0).sum(axis=-2)
 
 
-def cubic_rows(
-    places: Sequence[Float[np.ndarray, " direction"]], axes: Sequence[Axis], blocks: int = 1
-) -> scipy.sparse.csr_array:
-    """`cubic_weights` of several axes as sparse rows [direction, nodes], the mirrored ones included; on the host.
-
-    Of more than one block, each of as many directions, each has nodes of its own, [direction, block x nodes].
-    """
+def cubic_rows(places: Sequence[Float[np.ndarray, " direction"]], axes: Sequence[Axis]) -> scipy.sparse.csr_array:
+    """`cubic_weights` of several axes as sparse rows [direction, nodes], the mirrored ones included; on the host."""
     first, weight = zip(*map(cubic_weights, places, axes), strict=True)
     shape = tuple(axis.count + 2 for axis in axes)
     around = np.ravel_multi_index(tuple(np.indices((4,) * len(axes)).reshape(len(axes), -1)), shape)
-    block = np.repeat(np.arange(blocks) * math.prod(shape), len(places[0]) // blocks)
-    index = ((block + np.ravel_multi_index(first, shape))[:, None] + around).astype(np.int32)
+    index = np.ravel_multi_index(first, shape).astype(np.int32)[:, None] + around.astype(np.int32)
     product = weight[0]
     for other in weight[1:]:
         product = (product[:, :, None] * other[:, None, :]).reshape(len(product), -1)
     start = np.arange(0, product.size + 1, 4 ** len(axes), dtype=np.int32)
-    return scipy.sparse.csr_array((product.ravel(), index.ravel(), start), (len(product), blocks * math.prod(shape)))
+    return scipy.sparse.csr_array((product.ravel(), index.ravel(), start), (len(product), math.prod(shape)))
 
 
 def _four(first: Int[AnyArray, "*shape"]) -> Int[AnyArray, "*shape 4"]:
