@@ -4,7 +4,9 @@ import contextlib
 import ctypes
 import dataclasses
 import functools
+import importlib
 import os
+import threading
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 
@@ -84,6 +86,11 @@ def keep_freed_memory() -> None:
     if mallopt is not None:
         for option, size in HELD_MEMORY.items():
             mallopt(option, size)
+
+
+def import_ahead(*modules: str) -> None:
+    """Import modules that are needed later while XLA compiles, for which it leaves the interpreter free."""
+    threading.Thread(target=lambda: [importlib.import_module(name) for name in modules]).start()
 
 
 def require_float64() -> None:

@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     from sbrdf_jax.config import check_output, load_config, resolve
     from sbrdf_jax.errors import UserError
     from sbrdf_jax.formats import read
-    from sbrdf_jax.runtime import set_up_jax
+    from sbrdf_jax.runtime import import_ahead, set_up_jax
 
     start = time.perf_counter()
     options = resolve(load_config(args.config, args.overrides))
@@ -48,6 +48,7 @@ def run(args: argparse.Namespace) -> int:
     if args.plan:
         print(plan_text(ready.rows, ready.cost))
         return 0
+    import_ahead("colour", *(["sbrdf_jax.report"] if options.output.report else []))
     output = Path(options.output.path)
     with open_progress(output) as progress, before_stopping(lambda word: progress.log(f"stopped: {word}")):
         progress.say(f"{raw.source}: {ready.cleaned.report.num_kept} of {raw.num_samples} samples kept")
