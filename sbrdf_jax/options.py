@@ -116,7 +116,8 @@ class RepresentOptions:
 
     method: Literal["auto", "paper", "lobe_harmonics", "lobe_tensor"] = "auto"
     """paper: equations 13 to 16 of Xu's paper; this project's own: lobe_tensor, the whole field at once, and
-    lobe_harmonics, named lobes and harmonics at each incident angle; auto: the smallest that meets the target."""
+    lobe_harmonics, named lobes and harmonics at each incident angle; auto: the smaller of these two that meets
+    the target, or of a size the more exact one; the plan says what was tried."""
     target: TargetOptions = TargetOptions(ratio=125.0)
     """What to meet; ignored by paper."""
     max_degree: Auto | Annotated[int, Ge(0), Le(32)] = "auto"

@@ -122,6 +122,7 @@ def done_table(result: RunResult) -> Table:
         found = result.plan.get("represent", {})
         if "promised" in found:
             rows.append(("target", f"{found['promised']}; measured: {found['measured']}"))
+        rows += [("", f"{method}: {text}") for method, text in found.get("tried", {}).items()]
         rows.append(("lanes", count_statuses(result.compact.status)))
     ratios = [(name, text) for name, text in RATIOS if name in result.metrics]
     if ratios:

@@ -19,6 +19,7 @@ from sbrdf_jax.options import RepresentOptions, TargetOptions
 from sbrdf_jax.records import GriddedBRDF, SpectralField, Status
 from sbrdf_jax.representation import represent, represent_with_plan
 from sbrdf_jax.representation.direction_functions import direction_functions, num_direction_functions
+from sbrdf_jax.representation.half_field import half_field
 from sbrdf_jax.representation.tensor_fit import Normal, TensorFit
 from sbrdf_jax.representation.tensor_growth import grow
 from sbrdf_jax.representation.tensor_value import pad_ranks
@@ -28,7 +29,13 @@ ROUND = tolerance(ROUNDING, np.float64)
 THETA = np.radians(np.arange(0, 90.1, 15))
 PHI = np.radians(np.arange(0, 360.1, 15))
 WAVELENGTH_NM = np.linspace(400.0, 700.0, 9)
-NUMBERS = RepresentOptions(method="lobe_tensor", target=TargetOptions(numbers=120))
+
+
+def options(**target) -> RepresentOptions:
+    return RepresentOptions(method="lobe_tensor", target=TargetOptions(**target))
+
+
+NUMBERS = options(numbers=120)
 
 
 def truth(name, theta_i, theta_o, phi_o):
@@ -219,7 +226,7 @@ def test_the_group_alone_evaluates_to_the_same_numbers(amber, tmp_path, rng):
 def test_targets_are_met_and_the_plan_says_so(amber, target):
     gridded, field, _ = amber
     known = grid_of(gridded.brdf, extrapolated=np.repeat([0] * 6 + [2], 7 * 25).reshape(7, 7, 25))
-    found, plan = represent_with_plan(field, RepresentOptions(target=TargetOptions(**target)), known)
+    found, plan = represent_with_plan(field, options(**target), known)
     assert plan["is_met"] and not plan["warnings"] and plan["promised"]
     if "error" in target:
         assert eta(found, gridded)[:-1].max() <= 0.03
@@ -235,9 +242,20 @@ def test_targets_are_met_and_the_plan_says_so(amber, target):
 @pytest.mark.parametrize("target", [{"error": 1e-9}, {"numbers": 5}], ids=str)
 def test_what_cannot_be_met_is_the_best_and_a_warning(amber, target):
     gridded, field, _ = amber
-    found, plan = represent_with_plan(field, RepresentOptions(target=TargetOptions(**target)), gridded)
+    found, plan = represent_with_plan(field, options(**target), gridded)
     assert not plan["is_met"] and "is not met" in plan["warnings"][0]
     assert np.isfinite(eta(found, gridded)).all()
+
+
+def test_what_is_fitted_near_the_mirror_direction_is_between_the_last_two_azimuths(amber):
+    gridded, field, _ = amber
+    half = half_field(field, np.asarray(gridded.brdf), gridded)
+    nodes, near = half.nodes, half.blocks[2]
+    assert (near.phi_o > nodes.phi_o[-2]).all() and (near.phi_o < nodes.phi_o[-1]).all()
+    last = nodes.brdf[:, :, -2:]
+    assert (near.brdf >= last.min(axis=2, keepdims=True) * (1 - ROUND)).all()
+    assert (near.brdf <= last.max(axis=2, keepdims=True) * (1 + ROUND)).all()
+    assert (near.weight[half.known] > 0).all() and near.weight.max() < nodes.weight.max()
 
 
 @pytest.mark.parametrize("kind", ["cosine", "fourier", "identity"])

@@ -41,13 +41,13 @@ def represent_with_plan(
     What was found has `storage_error` [theta_i]: eta of eq. (18) between the form as stored and unrounded.
     """
     # here, because evaluation, which these methods use, imports the values of this package's records
-    from sbrdf_jax.representation import lobe_harmonics, lobe_tensor, paper
+    from sbrdf_jax.representation import auto, lobe_harmonics, lobe_tensor, paper
 
     require_float64()
     if options.method == "paper":
         compact, plan = paper.represent(field, options)
         return _stored(compact, plan, field, options, gridded, matching, None)
-    method = lobe_harmonics if options.method == "lobe_harmonics" else lobe_tensor
+    method = {"auto": auto, "lobe_harmonics": lobe_harmonics, "lobe_tensor": lobe_tensor}[options.method]
     with one_blas_thread():
         compact, plan = method.represent(field, options, gridded, matching, budget)
     num_theta_i, num_wavelengths = np.size(field.theta_i), np.size(field.basis.wavelength_nm)

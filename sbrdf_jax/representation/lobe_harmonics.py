@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from sbrdf_jax import colour
 from sbrdf_jax.encoding import decode, vector_basis
 from sbrdf_jax.options import ErrorBudget, RepresentOptions, TargetOptions
-from sbrdf_jax.records import GriddedBRDF, LobeHarmonics, SpectralField, Status
+from sbrdf_jax.records import GriddedBRDF, LobeHarmonics, LobeTensor, SpectralField, Status
 from sbrdf_jax.representation.allocation import Choice, angle_choices, make_ladder, spend
 from sbrdf_jax.representation.directions import SAME_ANGLE
 from sbrdf_jax.representation.half_field import HalfField, half_field
@@ -77,6 +77,15 @@ def _fixed_numbers(num_theta_i, degree, num_wavelengths, stores_vectors):
     return 2 * num_theta_i + num_wavelengths + NUM_LOBES + fitted * (1 + 3 * NUM_LOBES) + degree.size + count + vectors
 
 
+def least_numbers(tensor: LobeTensor) -> int:
+    """Count what one lobe and a constant at every incident angle that counts takes, beside a lobe tensor of a field."""
+    is_data, coefficients = tensor.basis.kind == "data", len(tensor.basis.synthesis)
+    fitted, count = int(np.sum(np.asarray(tensor.status) == int(Status.OK))), 1 if is_data else coefficients
+    num_theta_i, num_wavelengths = np.size(tensor.theta_i), np.size(tensor.basis.wavelength_nm)
+    fixed = _fixed_numbers(num_theta_i, np.zeros((fitted, count)), num_wavelengths, is_data)
+    return fixed + 2 * fitted * count
+
+
 def represent(
     field: SpectralField,
     options: RepresentOptions,
@@ -118,10 +127,10 @@ def represent(
     status = np.where(half.known, int(Status.OK), status)
     if half.known.any():
         fitted, limits = theta_i[half.known], width_limits(float(np.diff(theta_o).min()))
-        solution, achieved = _fit(field, half, target, max_degree, limits, matching)
+        solution, achieved, worst = _fit(field, half, target, max_degree, limits, matching)
         status[half.known] = _statuses(solution, limits)
     else:  # zero or nothing everywhere
-        fitted, achieved = theta_i[:1], 0.0
+        fitted, achieved, worst = theta_i[:1], 0.0, 0.0
         solution = _nothing(np.shape(field.coefficient)[3], len(even_orders(max_degree)))
     to_coefficient = channels_of(field.basis, half)[1] if half.blocks else np.eye(solution.degree.shape[1])
     used = solution.degree.shape[1]
@@ -145,13 +154,13 @@ def represent(
         interpolate_theta_i=field.interpolate_theta_i,
     )
     plan = {"method": "lobe_harmonics", "lobe_kinds": [SHAPES[k] for k in solution.lobes.kind.max(axis=0)]}
-    return compact, plan | make_plan(target, achieved, half)
+    return compact, plan | make_plan(target, achieved, worst, half)
 
 
 def _fit(
     field: SpectralField, half: HalfField, target: Target, max_degree: int, limits, matching
-) -> tuple[Solution, float]:
-    """Return what is stored, and what was measured of the target."""
+) -> tuple[Solution, float, float]:
+    """Return what is stored, what was measured of the target, and the worst incident angle's error or Delta E."""
     fit = _AngleFits(field, half, target, max_degree, limits, matching)
     best = None
     counts = range(1, fit.num_channels + 1) if fit.stores_vectors else [fit.num_channels]
@@ -239,7 +248,7 @@ class _AngleFits:
             [choice._replace(degree=self._all(choice.degree)) for choice in angle_choices(own, 1.0, num_channels)]
             for own in self.ladders
         ]
-        if self.target.kind in ("ratio", "numbers"):
+        if self.target.is_size:
             taken = spend(choices, self.target.budget - fixed)
             chosen = [own[k] for own, k in zip(choices, taken, strict=True)]
             numbers = fixed + sum(choice.numbers for choice in chosen)
@@ -287,7 +296,7 @@ class _AngleFits:
         found = value.reshape(1, *nodes.shape)
         return measured(target, 0, found, nodes[None], self.twins, np.ones(1, bool), self.matching)
 
-    def finish(self, chosen: list[Choice], num_channels: int) -> tuple[Solution, float]:
+    def finish(self, chosen: list[Choice], num_channels: int) -> tuple[Solution, float, float]:
         """Refine the chosen lobes with the chosen degrees, keep what is better, and solve for everything."""
         i = np.arange(len(chosen))
         degree = np.stack([choice.degree for choice in chosen])
@@ -309,12 +318,13 @@ class _AngleFits:
             reached.append(value)
         used = num_channels if self.stores_vectors else self.num_channels
         solution = Solution(refined, degree[:, :used], np.stack(heights)[..., :used], np.stack(backgrounds)[:, :used])
-        if self.target.kind in ("error", "delta_e"):
-            return solution, max(reached)
+        if not self.target.is_size:
+            return solution, max(reached), max(reached)
         fixed = _fixed_numbers(self.num_theta_i, solution.degree, self.num_wavelengths, self.stores_vectors)
         stored = fixed + sum(choice.numbers for choice in chosen)
         known = np.ones(len(self.brdf), bool)
-        return solution, measured(self.target, stored, self.brdf, self.brdf, self.twins, known, None)
+        achieved = measured(self.target, stored, self.brdf, self.brdf, self.twins, known, None)
+        return solution, achieved, max(reached)
 
 
 def _of_neighbour(lobes: Lobes, theta_i: np.ndarray, step: int) -> Lobes:

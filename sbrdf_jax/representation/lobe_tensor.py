@@ -107,9 +107,9 @@ def represent(
     basis = field.basis
     if not half.blocks:  # zero or nothing everywhere
         factors, log_scale = Factors(*(np.zeros((n, 1)) for n in functions), _no_core(basis)), np.zeros(num_i)
-        achieved = 0.0
+        achieved = worst = 0.0
     else:
-        factors, log_scale, basis, achieved = _fit(field, half, layout, target, floor, matching)
+        factors, log_scale, basis, achieved, worst = _fit(field, half, layout, target, floor, matching)
     tensor = LobeTensor(
         theta_i,
         ends,
@@ -121,11 +121,11 @@ def represent(
         interpolate_theta_i=field.interpolate_theta_i,
     )
     plan = {"method": "lobe_tensor", "ranks": np.array(np.shape(tensor.core)), "half_field": half}
-    return tensor, plan | make_plan(target, achieved, half)
+    return tensor, plan | make_plan(target, achieved, worst, half)
 
 
 def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, floor: float, matching):
-    """Return factors, scales, the basis that they are in, and what was measured of the target."""
+    """Return factors, scales, the basis that they are in, what was measured of the target, and the worst error."""
     vectors, to_coefficient = channels_of(field.basis, half)
     place = np.isin(np.asarray(field.theta_i, np.float64), half.nodes.theta_i)
     rows = np.unique(np.concatenate([block.theta_i for block in half.blocks]))
@@ -171,7 +171,7 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
 
     def measure(target: Target, factors: Factors) -> float:
         stored = layout.numbers(*factors.ranks, factors.core.shape[3])
-        if target.kind in ("ratio", "numbers"):
+        if target.is_size:
             return measured(target, stored, nodes.brdf, nodes.brdf, seen[0].twins, counts, None)
         found = value(seen[0], factors)
         return measured(target, stored, found, nodes.brdf, seen[0].twins, counts, matching, nodes.needed)
@@ -193,8 +193,9 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
     most = min(target.budget, spectra + np.mean(nodes.needed) * target.budget)
     factors = grow(fit, layout.numbers, most, is_enough, first_channels=first)
     achieved, used = measure(target, factors), factors.core.shape[3]
+    worst = measure(target._replace(kind="error"), factors) if target.is_size else achieved
     basis = vector_basis(field.basis.wavelength_nm, vectors[:used]) if layout.stores_vectors else field.basis
-    return factors._replace(core=factors.core @ to_coefficient[:used, :used]), log_scale, basis, achieved
+    return factors._replace(core=factors.core @ to_coefficient[:used, :used]), log_scale, basis, achieved, worst
 
 
 class _Seen(NamedTuple):
@@ -237,8 +238,8 @@ def _no_core(basis: SpectralBasis) -> np.ndarray:
     return np.zeros((1, 1, 1, np.shape(basis.synthesis)[0]))
 
 
-def make_plan(target: Target, achieved: float, half: HalfField) -> dict[str, Any]:
-    """Say what was promised and what was measured."""
+def make_plan(target: Target, achieved: float, worst: float, half: HalfField) -> dict[str, Any]:
+    """Say what was promised and what was measured; `worst`: the worst incident angle's error, or Delta E if asked."""
     met = is_met(target, achieved)
     warnings = []
     if not met:
@@ -250,5 +251,6 @@ def make_plan(target: Target, achieved: float, half: HalfField) -> dict[str, Any
         "promised": target.text,
         "measured": in_words(target, achieved),
         "is_met": int(met),
+        "worst": worst,
         "warnings": warnings,
     }

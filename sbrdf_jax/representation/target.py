@@ -20,6 +20,11 @@ class Target(NamedTuple):
     enough: tuple[tuple[str, float], ...] = ()  # errors by kind: where all of them are reached, the search ends
 
     @property
+    def is_size(self) -> bool:
+        """True where numbers are promised, not errors."""
+        return self.kind in ("ratio", "numbers")
+
+    @property
     def stops(self) -> tuple["Target", ...]:
         """Errors at which to stop, as targets of their own."""
         return tuple(Target(kind, value, float("inf")) for kind, value in self.enough)
@@ -101,7 +106,7 @@ def measured(
 ) -> float:
     """Return what stands beside the promise: the ratio, the numbers, or the worst incident angle's error."""
     needed = np.ones(found.shape[:3], bool) if needed is None else needed
-    if target.kind in ("ratio", "numbers"):
+    if target.is_size:
         return target.value * (target.budget / stored if target.kind == "ratio" else stored / target.budget)
     if target.kind == "error":
         found, wanted = (np.where(needed[..., None], brdf, 0.0) for brdf in (found, wanted))
