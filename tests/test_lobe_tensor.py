@@ -247,17 +247,6 @@ def test_what_cannot_be_met_is_the_best_and_a_warning(amber, target):
     assert np.isfinite(eta(found, gridded)).all()
 
 
-def test_what_is_fitted_near_the_mirror_direction_is_between_the_last_two_azimuths(amber):
-    gridded, field, _ = amber
-    half = half_field(field, np.asarray(gridded.brdf), gridded)
-    nodes, near = half.nodes, half.blocks[2]
-    assert (near.phi_o > nodes.phi_o[-2]).all() and (near.phi_o < nodes.phi_o[-1]).all()
-    last = nodes.brdf[:, :, -2:]
-    assert (near.brdf >= last.min(axis=2, keepdims=True) * (1 - ROUND)).all()
-    assert (near.brdf <= last.max(axis=2, keepdims=True) * (1 + ROUND)).all()
-    assert (near.weight[half.known] > 0).all() and near.weight.max() < nodes.weight.max()
-
-
 @pytest.mark.parametrize("kind", ["cosine", "fourier", "identity"])
 def test_other_spectral_bases(amber, kind):
     gridded, _, _ = amber
