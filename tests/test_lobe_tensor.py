@@ -19,7 +19,6 @@ from sbrdf_jax.options import RepresentOptions, TargetOptions
 from sbrdf_jax.records import GriddedBRDF, SpectralField, Status
 from sbrdf_jax.representation import represent, represent_with_plan
 from sbrdf_jax.representation.direction_functions import direction_functions, num_direction_functions
-from sbrdf_jax.representation.half_field import half_field
 from sbrdf_jax.representation.tensor_fit import Normal, TensorFit
 from sbrdf_jax.representation.tensor_growth import grow
 from sbrdf_jax.representation.tensor_value import pad_ranks
