@@ -292,7 +292,7 @@ def host_function(result: Any, wavelength_nm: Float[np.ndarray, " query"] | None
 def numbers_per_direction(result) -> int:
     """Rough count of the numbers that one direction needs while it is evaluated."""
     if isinstance(result, GuidedField) or getattr(result, "field", None) is not None:
-        return 2 * 4**3 * len(result.wavelength_nm)  # the nodes around it on two grids
+        return 3 * 4**3 * len(result.wavelength_nm)  # the nodes around it on three grids
     if isinstance(result, GriddedBRDF):
         return 8 * int(np.prod(result.brdf.shape[1:3])) + 4 * result.brdf.shape[3]
     if isinstance(result, SpectralField):

@@ -17,7 +17,7 @@ from sbrdf_jax.resampling.guided.merging import MAX_CENTRES as MOST_CENTRES
 CRITICAL_ANGLES = 21
 MEBI = 2**20
 RATE = 3e10  # operations a second of a large product
-FEATURES = 1100  # of a direction on the guided method's two grids
+FEATURES = 1300  # of a direction on the guided method's grids
 NODES_OF_A_HEMISPHERE = 13 * 25
 EQUAL = {"guided": 1e-9, "paper": 1e-6}  # see `describe_needs`
 

@@ -1,6 +1,6 @@
 """The guided method: a robust lobe model, and a smooth residual in coordinates where a glossy field is smooth.
 
-The field is fitted in a generalised logarithm, by bounded least squares on two uniform
+The field is fitted in a generalised logarithm, by bounded least squares on three uniform
 grids, for all wavelengths at once; everything that depends on angles alone is shared.
 """
 

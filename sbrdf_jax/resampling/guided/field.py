@@ -1,4 +1,4 @@
-"""The fitted field and its evaluation: lobe model plus the residual of two grids, in the generalised logarithm."""
+"""The fitted field and its evaluation: lobe model plus the residual of three grids, in the generalised logarithm."""
 
 import dataclasses
 from collections.abc import Callable

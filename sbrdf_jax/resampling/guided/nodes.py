@@ -92,7 +92,7 @@ class Term(NamedTuple):
 
 @pytree(static=("reciprocal",))
 class ModeVariance:
-    """Prior variance of each cosine mode; E^-1 of either grid is modes x variance x modes'."""
+    """Prior variance of each cosine mode; E^-1 of a grid is modes x variance x modes'."""
 
     half: Any  # [half, theta_i, theta_o]
     azimuth: Any  # [azimuth, theta_i, theta_o]
