@@ -207,10 +207,12 @@ def _four(first: Int[AnyArray, "*shape"]) -> Int[AnyArray, "*shape 4"]:
 
 def axis_features(x: Float[AnyArray, "*shape"], axis: Axis) -> Float[AnyArray, "*shape mode"]:
     """Values of the interpolated cosine modes at places along an axis."""
-    first, weight = cubic_weights(x, axis)
-    mirrored = np.pad(axis.modes, ((1, 1), (0, 0)), mode="reflect")
-    around = array_module(x).asarray(mirrored, x.dtype)[_four(first)]
-    return (weight[..., None] * around).sum(axis=-2)
+    return cubic_matrix(x, axis) @ array_module(x).asarray(_mirrored_modes(axis), x.dtype)
+
+
+@functools.cache
+def _mirrored_modes(axis: Axis) -> np.ndarray:
+    return np.pad(axis.modes, ((1, 1), (0, 0)), mode="reflect")
 
 
 @pytree()
