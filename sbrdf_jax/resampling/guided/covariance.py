@@ -20,9 +20,7 @@ from sbrdf_jax.array_module import AnyArray, array_module
 from sbrdf_jax.records import pytree
 from sbrdf_jax.resampling.guided.coordinates import Coordinates, coordinates_on_axes, exchanged, guided_coordinates
 from sbrdf_jax.resampling.guided.nodes import (
-    DIFFERENCE,
     GRIDS,
-    HALF,
     LEAN,
     POLAR_GRIDS,
     THETA,
@@ -162,10 +160,10 @@ def covariance_on_axes(
     polar = along_i[:, :, None] * along_o[:, None, :]  # [o, mode of theta_i, mode of theta_o]
     if variance.reciprocal:
         polar = (polar + xp.swapaxes(polar, 1, 2)) / 2
-    lean = axis_features(at.lean[:, :1], LEAN)  # the same for all azimuths
+    lean, *others = difference_features(at)  # lean [o, 1, mode]
     if variance.reciprocal:
-        lean = (lean + axis_features(-at.lean[:, :1], LEAN)) / 2
-    along = lean, axis_features(at.half, HALF), axis_features(at.difference, DIFFERENCE)
+        lean = (lean + axis_features(-at.lean, LEAN)) / 2
+    along = lean, *others
     total, prior = 0.0, _own_along_axes(variance, along, along)
     for name, grid in POLAR_GRIDS.items():
         around, at_centre = (axis_features(getattr(x, name), grid.axes[0]) for x in (at, places))
@@ -204,10 +202,8 @@ def node_values(
     if variance.reciprocal:
         for name in POLAR_GRIDS:
             sums[name] = (sums[name] + array_module(dual).swapaxes(sums[name], 1, 2)) / 2
-        is_even = np.where(
-            np.arange(LEAN.count) % 2 == 0, 1.0, 0.0
-        )  # the other modes change sign with theta_i - theta_o
-        sums["difference"] = sums["difference"] * is_even[:, None, None, None]
+        is_odd = np.arange(LEAN.count) % 2  # these modes change sign with theta_i - theta_o
+        sums["difference"] = sums["difference"] * (1.0 - is_odd)[:, None, None, None]
     return {
         name: synthesise(modes * getattr(variance, name)[..., None], GRIDS[name].axes) for name, modes in sums.items()
     }

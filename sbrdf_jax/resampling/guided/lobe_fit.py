@@ -67,16 +67,19 @@ def fit_lobe_model(
     every = max(1, z.shape[1] // NUM_FIT_WAVELENGTHS)
     with one_blas_thread():
         shape = _fit_shape(problem._replace(z=problem.z[::every]), amplitude[::every])
-    return fit_amplitudes(shape, value, z, at, weight, floor)
+    return _of_shape(shape, problem, amplitude)
 
 
 def fit_amplitudes(
     shape: np.ndarray, value: np.ndarray, z: np.ndarray, at: Coordinates, weight: np.ndarray, floor: float
 ) -> tuple[LobeModel, np.ndarray]:
     """Do what `fit_lobe_model` does for a shape that is known."""
-    problem, amplitude = _problem(value, z, at, weight, floor)
+    return _of_shape(shape, *_problem(value, z, at, weight, floor))
+
+
+def _of_shape(shape: np.ndarray, problem: _Problem, start: np.ndarray) -> tuple[LobeModel, np.ndarray]:
     with one_blas_thread():
-        amplitude, gradient = _fit_amplitudes(problem, lobe_terms(shape, at), amplitude)
+        amplitude, gradient = _fit_amplitudes(problem, lobe_terms(shape, problem.at), start)
     return LobeModel(shape, amplitude.T), gradient
 
 
