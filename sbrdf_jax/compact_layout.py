@@ -23,14 +23,15 @@ from sbrdf_jax.representation.lobe_family import SHAPES
 from sbrdf_jax.representation.lobe_harmonics import stored_harmonics
 from sbrdf_jax.representation.lobe_harmonics_value import even_orders
 from sbrdf_jax.representation.storage import Written, first_axis, narrowest, read_back, written
+from sbrdf_jax.representation.tensor_pruning import WORD, num_words
 
 _FACTORS = {  # dataset: its axes
     "log_scale": ("theta_i_function",),
     "theta_i_factor": ("theta_i_function", "theta_i_rank"),
     "theta_o_factor": ("theta_o_function", "theta_o_rank"),
     "direction_factor": ("direction_function", "direction_rank"),
-    "core": ("theta_i_rank", "theta_o_rank", "direction_rank", "coefficient"),
 }
+_CORE = ("theta_i_rank", "theta_o_rank", "direction_rank", "coefficient")
 
 
 class _Writer(NamedTuple):
@@ -54,14 +55,19 @@ class _Writer(NamedTuple):
         value = narrowest(value) if self.is_narrow else value
         return dataset(self.group, name, value, units, axes, narrow=self.is_narrow)
 
-    def values(self, name: str, value, units: str, axes: list[h5py.Dataset], rows=None) -> h5py.Dataset:
-        """Write what is rounded; `rows`: the slice of each entry, its place along the first axis unless given."""
+    def values(
+        self, name: str, value, units: str, axes: list[h5py.Dataset], rows=None, of: str = "theta_i"
+    ) -> h5py.Dataset:
+        """Write what is rounded; `rows`: the slice of each entry, its place along the first axis unless given.
+
+        `of`: what the slices are then entries of.
+        """
         value = np.asarray(value, np.float64)
         found = written(value, self.storage, first_axis(value.shape) if rows is None else rows)
         made = dataset(self.group, name, found.number, units, axes, narrow=self.is_narrow)
         if found.exponent is not None:
             made.attrs["exponent"], made.attrs["offset"] = narrowest(found.exponent), narrowest(found.offset)
-            slices = "theta_i" if rows is not None else "the first axis"
+            slices = "the first axis" if rows is None else of
             made.attrs["storage"] = f"value = (number - offset) * 2**exponent, one for each entry of {slices}"
         return made
 
@@ -132,6 +138,12 @@ def _write_tensor(writer: _Writer, tensor: LobeTensor) -> None:
             axes[axis] = axes.get(axis) or writer.scale(axis, np.arange(size), "1")
         write = writer.exact if name == "log_scale" else writer.values
         write(name, value, "1", [axes[axis] for axis in names])
+    core = np.asarray(tensor.core, np.float64)
+    is_stored = core != 0
+    stored = writer.values("core", core[is_stored], "1", [], np.nonzero(is_stored)[0], of=_CORE[0])
+    stored.attrs["meaning"] = f"cells by {', '.join(_CORE)}, those that are 0 left out"
+    words = dataset(group, "core_stored", _bit_words(is_stored), "1", [], narrow=writer.is_narrow)
+    words.attrs["meaning"] = f"a bit for each cell, lowest of a word first: 1 if it is stored; by {', '.join(_CORE)}"
     group["log_scale"].attrs["meaning"] = "coefficients [1/sr] are exp(-log_scale) times what the factors make"
     ends = writer.scale("theta_i_range_deg", degrees(tensor.theta_i_range), "deg")
     ends.attrs["meaning"] = "splines of theta_i span this range; beyond it the factors are those of its ends"
@@ -141,8 +153,16 @@ def _write_tensor(writer: _Writer, tensor: LobeTensor) -> None:
 def _read_tensor(group: h5py.Group) -> LobeTensor:
     """Read scales, factors and core."""
     theta_i, wavelength_nm = read(group, "theta_i_deg"), read(group, "wavelength_nm")
-    sizes = {axis: len(read(group, axis)) for names in _FACTORS.values() for axis in names}
+    sizes = {axis: len(read(group, axis)) for names in (*_FACTORS.values(), _CORE) for axis in names}
     factors = {name: read(group, name, tuple(sizes[axis] for axis in names)) for name, names in _FACTORS.items()}
+    shape = tuple(sizes[axis] for axis in _CORE)
+    if "core_stored" in group:
+        words = read_as_written(group, "core_stored", (num_words(int(np.prod(shape))),))
+        is_stored = _bits(words, shape)
+        core = np.zeros(shape)
+        core[is_stored] = read(group, "core", (int(is_stored.sum()),), rows=np.nonzero(is_stored)[0])
+    else:  # results of earlier versions hold all cells
+        core = read(group, "core", shape)
     return LobeTensor(
         theta_i=np.deg2rad(theta_i),
         theta_i_range=np.deg2rad(read(group, "theta_i_range_deg", (2,))),
@@ -151,8 +171,22 @@ def _read_tensor(group: h5py.Group) -> LobeTensor:
         half_angle_floor=float(attribute(group, "half_angle_floor")),
         interpolate_theta_i=bool(attribute(group, "interpolate_theta_i")),
         storage=_storage_of(group),
+        core=core,
         **factors,
     )
+
+
+def _bit_words(mask: np.ndarray) -> np.ndarray:
+    """Return a bit for each entry of a mask in words of 64, the lowest of a word first."""
+    padded = np.zeros(num_words(mask.size) * WORD, bool)
+    padded[: mask.size] = mask.ravel()
+    return np.packbits(padded, bitorder="little").view("<u8")
+
+
+def _bits(words: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the mask that `_bit_words` was given."""
+    bits = np.unpackbits(words.astype("<u8").view(np.uint8), bitorder="little")
+    return bits[: int(np.prod(shape))].reshape(shape).astype(bool)
 
 
 def _write_harmonics(writer: _Writer, compact: LobeHarmonics) -> None:

@@ -19,8 +19,9 @@ from sbrdf_jax.options import RepresentOptions, TargetOptions
 from sbrdf_jax.records import GriddedBRDF, SpectralField, Status
 from sbrdf_jax.representation import represent, represent_with_plan
 from sbrdf_jax.representation.direction_functions import direction_functions, num_direction_functions
-from sbrdf_jax.representation.tensor_fit import Normal, TensorFit
+from sbrdf_jax.representation.tensor_fit import Factors, Normal, TensorFit
 from sbrdf_jax.representation.tensor_growth import grow
+from sbrdf_jax.representation.tensor_pruning import prune
 from sbrdf_jax.representation.tensor_value import pad_ranks
 from sbrdf_jax.splines import spline_weights
 
@@ -155,8 +156,57 @@ def test_a_promise_that_settling_would_break_is_kept(rng):
         asked.append(factors)
         return len(asked) == 1  # before settling, and not after
 
-    found = grow(fit, lambda a, b, q, c: 1, 10.0, is_enough, first_channels=2)
-    assert len(asked) == 2 and found is asked[0]
+    found = grow(fit, lambda a, b, q, c, core: 1, 1e6, is_enough, first_channels=2)
+    assert len(asked) == 3  # the last is pruned once more, and no longer enough
+
+    def value(factors):
+        return w.swapaxes(2, 3) @ factors.direction @ fit.amplitudes(factors.theta_i, factors.theta_o, factors.core)
+
+    np.testing.assert_allclose(value(found), value(asked[0]), rtol=0, atol=1e-6 * np.abs(value(asked[0])).max())
+
+
+def test_pruning_takes_the_cell_that_matters_least_and_solves_anew(rng):
+    at_i, at_o, function = rng.normal(size=(5, 4)), rng.normal(size=(6, 4)), rng.normal(size=(5, 6, 7, 3))
+    moment = np.swapaxes(function, 2, 3) @ rng.normal(size=(5, 6, 7, 2))
+    fit = TensorFit(Normal(np.swapaxes(function, 2, 3) @ function, moment, 1e3, at_i, at_o))
+    u, v, w = (rng.normal(size=(n, 2)) for n in (4, 4, 3))
+    whole = Factors(u, v, w, fit.solve_core(u, v, fit.project(w)).value)
+    found = prune(fit, whole, whole.core.size - 1, lambda factors: False)
+    assert np.count_nonzero(found.core) == whole.core.size - 1
+
+    u, v, w = found[:3]
+    design = np.einsum("ia,ob,iopq->iopabq", at_i @ u, at_o @ v, function @ w).reshape(5 * 6 * 7, -1)
+    wanted = np.linalg.lstsq(design.T, moment_of(fit, u, v, w), rcond=None)[0]  # any values of this moment
+    error = {}
+    for lost in np.ndindex(found.core.shape):
+        channel, cell = lost[3], np.ravel_multi_index(lost[:3], found.core.shape[:3])
+        kept = np.delete(np.arange(design.shape[1]), cell)
+        core, *_ = np.linalg.lstsq(design[:, kept], wanted[:, channel], rcond=None)
+        before = np.linalg.lstsq(design, wanted[:, channel], rcond=None)[0]
+        error[lost] = np.sum((design[:, kept] @ core - design @ before) ** 2)
+        if found.core[lost] == 0:
+            rest = found.core[..., channel].ravel()[kept]
+            np.testing.assert_allclose(rest, core, rtol=0, atol=1e-4 * np.abs(core).max())
+    assert found.core[min(error, key=lambda lost: error[lost])] == 0
+
+
+def moment_of(fit, u, v, w):
+    """The right side [a b q, channel] of the core's normal equations."""
+    at_i, at_o = fit.normal.theta_i @ u, fit.normal.theta_o @ v
+    return np.einsum("ia,ob,kq,iokc->abqc", at_i, at_o, w, fit.normal.moment).reshape(-1, 2)
+
+
+def test_a_budget_is_used_and_kept(amber):
+    assert 0.99 * 120 * len(THETA) <= stored_numbers(amber[2]) <= 120 * len(THETA)
+
+
+def test_a_result_that_holds_all_cells_of_the_core_is_read(amber, tmp_path):
+    path, (gridded, _, found) = tmp_path / "r.h5", amber
+    store.save(path, store.RunResult(gridded=gridded, compact=found))
+    with h5py.File(path, "r+") as file:
+        del file["compact/core"], file["compact/core_stored"]
+        file["compact/core"] = found.core
+    np.testing.assert_array_equal(store.load(path).compact.core, found.core)
 
 
 def test_a_sharp_lobe_costs_few_numbers_at_the_nodes_and_between_them(amber):

@@ -312,4 +312,4 @@ def test_numbers_with_units_of_their_own_are_not_stacked(tmp_path, forms):
     compact = round_form(form, "quantised", 9)
     store.save(path, store.RunResult(gridded=gridded, compact=compact, config="input: {path: builtin:amber_glass}\n"))
     layout = check_result(path).layout
-    assert "compact/status" in layout and "compact/core" not in layout and "grid/brdf" in layout
+    assert '"compact/status"' in layout and '"compact/core"' not in layout and '"grid/brdf"' in layout

@@ -23,6 +23,7 @@ from sbrdf_jax.representation.half_field import Block, HalfField, half_field
 from sbrdf_jax.representation.target import Target, in_words, is_met, make_target, measured, node_errors
 from sbrdf_jax.representation.tensor_fit import Factors, Normal, TensorFit
 from sbrdf_jax.representation.tensor_growth import grow
+from sbrdf_jax.representation.tensor_pruning import stored_cells
 from sbrdf_jax.splines import spline_weights
 
 MOST_FUNCTIONS = 13  # of one polar angle; the factors are smooth, however fine the grid
@@ -38,12 +39,12 @@ class Layout(NamedTuple):
     num_wavelengths: int
     stores_vectors: bool  # basis "data": its vectors are counted
 
-    def numbers(self, a: int, b: int, q: int, channels: int) -> int:
-        """Count all numbers that the `compact` group holds, its axes included."""
+    def numbers(self, a: int, b: int, q: int, channels: int, core: int) -> int:
+        """Count all numbers that the `compact` group holds, its axes and the `core` of a core included."""
         n_i, n_o, n_q = self.functions
         axes = 2 * self.num_theta_i + 2 + self.num_wavelengths + sum(self.functions) + a + b + q + channels
         vectors = channels * self.num_wavelengths if self.stores_vectors else 0
-        return axes + n_i + n_i * a + n_o * b + n_q * q + a * b * q * channels + vectors
+        return axes + n_i + n_i * a + n_o * b + n_q * q + core + vectors
 
 
 def stored_numbers(tensor: LobeTensor) -> int:
@@ -52,7 +53,9 @@ def stored_numbers(tensor: LobeTensor) -> int:
     factors = tensor.theta_i_factor, tensor.theta_o_factor, tensor.direction_factor
     functions = tuple(len(factor) for factor in factors)
     num_wavelengths, is_data = np.size(tensor.basis.wavelength_nm), tensor.basis.kind == "data"
-    return Layout(np.size(tensor.theta_i), functions, num_wavelengths, is_data).numbers(a, b, q, channels)
+    return Layout(np.size(tensor.theta_i), functions, num_wavelengths, is_data).numbers(
+        a, b, q, channels, stored_cells(tensor.core)
+    )
 
 
 def represent(
@@ -170,7 +173,7 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
         return np.maximum(value / scale[part.rows][:, None, None, None], 0.0)
 
     def measure(target: Target, factors: Factors) -> float:
-        stored = layout.numbers(*factors.ranks, factors.core.shape[3])
+        stored = layout.numbers(*factors.ranks, factors.core.shape[3], stored_cells(factors.core))
         if target.is_size:
             return measured(target, stored, nodes.brdf, nodes.brdf, seen[0].twins, counts, None)
         found = value(seen[0], factors)

@@ -15,7 +15,8 @@ import scipy.linalg.lapack
 from jaxtyping import Float
 
 NOTHING = 1e-30  # of the largest diagonal element: a column that has died out, whose unknowns become 0
-RIDGE = 1e-5  # relative to the diagonal: what no value shows stays small, and directions between run not wild
+WIDER = 6  # columns of a factor for each one more that a step adds to it
+RIDGE = 1e-6  # relative to the diagonal: what no value shows stays small, and directions between run not wild
 
 
 class Factors(NamedTuple):
@@ -48,6 +49,14 @@ class Projection(NamedTuple):
 
     gram: Float[np.ndarray, "i o q q"]
     moment: Float[np.ndarray, "i o q channel"]
+
+
+class CoreProblem(NamedTuple):
+    """Normal equations of a core, their diagonal scaled to 1 and the ridge on it."""
+
+    matrix: Float[np.ndarray, "cell cell"]
+    right: Float[np.ndarray, "cell channel"]
+    scale: Float[np.ndarray, " cell"]  # the core is this times the solution
 
 
 class SolvedCore(NamedTuple):
@@ -107,24 +116,31 @@ class TensorFit:
         value = core.reshape(u.shape[1], v.shape[1], projection.moment.shape[2], -1)
         return SolvedCore(value, gain, at, projection, root, scale, scale[:, None] * right)
 
-    def added_gain(self, solved: SolvedCore, factors, mode: int, wide) -> Float[np.ndarray, " channel"]:
-        """Return by how much each channel lowers the error further if one factor has one more column.
+    def core_problem(self, factors: Factors) -> CoreProblem:
+        """Return what decides on the core of given factors, for the channels that it has."""
+        projection = self.project(factors.direction)
+        at = self.normal.theta_i @ factors.theta_i, self.normal.theta_o @ factors.theta_o
+        right = _core_right(at, projection.moment[..., : factors.core.shape[3]])
+        return _scaled(_core_matrix(at, at, projection.gram), right)
 
-        The unknowns that it brings are solved for by their Schur complement; what is factorised stays.
+    def added_gain(self, solved: SolvedCore, factors, mode: int, wide) -> Float[np.ndarray, " channel"]:
+        """Return by how much each channel lowers the error further if one factor has more columns.
+
+        The unknowns that they bring are solved for by their Schur complement; what is factorised stays.
 
         Args:
             solved: The core of `factors`.
             factors: The factors.
             mode: Which factor is widened.
-            wide: The widened factor, its new column last.
+            wide: The widened factor, its new columns last.
         """
-        n, column = self.normal, wide[:, -1:]
+        n, column = self.normal, wide[:, factors[mode].shape[1] :]
         new, held, gram, moment = list(solved.at), solved.at, solved.projection.gram, solved.projection.moment
         if mode < 2:
             new[mode] = (n.theta_i, n.theta_o)[mode] @ column
             own = gram
         else:
-            along = column.T @ n.gram  # [i, o, 1, direction_function]
+            along = column.T @ n.gram  # [i, o, new, direction_function]
             gram, own, moment = along @ factors[2], along @ column, column.T @ n.moment
         across = _core_matrix(new, held, gram) * solved.scale
         block, right = _core_matrix(new, new, own), _core_right(new, moment)
@@ -132,7 +148,7 @@ class TensorFit:
         known = solved.value.reshape(len(solved.scale), -1) / solved.scale[:, None]
         explained = scipy.linalg.solve_triangular(solved.root, across.T, lower=True, check_finite=False)
         schur = block + np.diag(diagonal) - explained.T @ explained
-        added = scipy.linalg.solve(schur, right - across @ known, assume_a="pos", check_finite=False)
+        added = _solve(schur, right - across @ known, ridge=0.0)[0]  # it is on the diagonal already
         known -= scipy.linalg.solve_triangular(
             solved.root, explained @ added, lower=True, trans="T", check_finite=False
         )
@@ -175,7 +191,7 @@ class TensorFit:
         return np.tensordot(np.tensordot(at_i, core, (1, 0)), at_o, (1, 1)).transpose(0, 3, 1, 2)
 
     def widened(self, factors, core) -> list[np.ndarray | None]:
-        """Return each factor with one more column, the leading one of the residual; None at its limit."""
+        """Return each factor with more columns, the leading ones of the residual; None at its limit."""
         u, v, w = factors
         n, channels = self.normal, core.shape[3]
         rest = n.moment[..., :channels] - n.gram @ (w @ self.amplitudes(u, v, core))
@@ -188,14 +204,15 @@ class TensorFit:
         found: list[np.ndarray | None] = []
         for mode, (matrix, root) in enumerate(zip(steepest, self.roots, strict=True)):
             others = [f.shape[1] for k, f in enumerate(factors) if k != mode]
-            rank = factors[mode].shape[1] + 1
-            if rank > len(matrix) or rank > others[0] * others[1] * channels:
+            held = factors[mode].shape[1]
+            more = min(1 + held // WIDER, len(matrix) - held, others[0] * others[1] * channels - held)
+            if more < 1:
                 found.append(None)
                 continue
             scaled = scipy.linalg.solve_triangular(root, matrix, trans="T")
-            leading = np.linalg.eigh(scaled @ scaled.T)[1][:, -1:]
-            column = scipy.linalg.solve_triangular(root, leading)
-            found.append(self.orthonormal(mode, np.concatenate([factors[mode], column], axis=1))[0])
+            leading = np.linalg.eigh(scaled @ scaled.T)[1][:, -more:]
+            columns = scipy.linalg.solve_triangular(root, leading)
+            found.append(self.orthonormal(mode, np.concatenate([factors[mode], columns], axis=1))[0])
         return found
 
 
@@ -246,14 +263,19 @@ def _living(diagonal):
     return np.where(diagonal > NOTHING * diagonal.max(), diagonal, 1.0)
 
 
-def _solve(matrix, right):
-    """Solve normal equations after scaling their diagonal to 1, with a small ridge.
+def _scaled(matrix, right, ridge: float = RIDGE) -> CoreProblem:
+    """Scale the diagonal of normal equations to 1, and add a small ridge."""
+    scale = 1 / np.sqrt(_living(np.diag(matrix)))
+    return CoreProblem(matrix * scale[:, None] * scale + ridge * np.eye(len(matrix)), scale[:, None] * right, scale)
+
+
+def _solve(matrix, right, ridge: float = RIDGE):
+    """Solve normal equations.
 
     Returns:
         The solution, the lower Cholesky factor of the scaled matrix, and the scale.
     """
-    scale = 1 / np.sqrt(_living(np.diag(matrix)))
-    scaled, right = matrix * scale[:, None] * scale + RIDGE * np.eye(len(matrix)), scale[:, None] * right
+    scaled, right, scale = _scaled(matrix, right, ridge)
     root, found, failed = scipy.linalg.lapack.dposv(scaled, right, lower=1, overwrite_a=1, overwrite_b=1)
     if failed:
         raise np.linalg.LinAlgError("normal equations are not positive definite")

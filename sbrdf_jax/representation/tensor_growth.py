@@ -1,4 +1,7 @@
-"""Which ranks a lobe tensor has: grown step by step, by the error that each stored number takes away."""
+"""Which ranks a lobe tensor has: grown step by step, by the error that each stored number takes away.
+
+Growth counts half of the core's cells; at its end those that matter least are left out.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -6,17 +9,19 @@ from typing import NamedTuple
 import numpy as np
 
 from sbrdf_jax.representation.tensor_fit import Factors, TensorFit
+from sbrdf_jax.representation.tensor_pruning import num_words, prune
 
-MOST_CELLS = 900  # of the core for one channel; its normal equations have so many unknowns
+KEPT = 0.5  # of the core's cells, as growth counts them: what pruning takes away costs hardly any error
+MOST_CELLS = 1800  # of the core for one channel; its normal equations have so many unknowns
 ALIKE = 0.8  # of the best step's score: such steps are taken with it
 LEAST_GAIN = 2e-3  # of the squared error; a step that gains less is noise, and growth ends
-MOST_SWEEPS, SWEEP_GAIN = 30, 0.02  # before and after the growth; of the squared error
+MOST_SWEEPS, SWEEP_GAIN = 30, 0.1  # before and after the growth; of the squared error
 NO_ERROR = 1e-24  # squared, relative; below it is rounding
 
 
 def grow(
     fit: TensorFit,
-    numbers: Callable[[int, int, int, int], int],
+    numbers: Callable[[int, int, int, int, int], int],
     budget: float,
     is_enough: Callable[[Factors], bool],
     *,
@@ -26,17 +31,21 @@ def grow(
 
     Args:
         fit: The problem; its channels are in the order in which they are taken.
-        numbers: Stored numbers by the ranks a, b, q and the number of channels.
+        numbers: Stored numbers by the ranks a, b, q, the number of channels and that of the core's numbers.
         budget: Most numbers.
-        is_enough: Asked after each step; the first that is enough is polished and returned.
+        is_enough: Asked after each step; the first that is enough is polished and pruned as far as it stays so.
         first_channels: Channels to start with.
     """
     energy = fit.normal.energy
     factors, channels = _settle(fit, fit.start(), first_channels), first_channels
 
-    def fits(factors, channels: int) -> bool:
+    def expected(factors, channels: int) -> int:
         ranks = [f.shape[1] for f in factors]
-        return bool(np.prod(ranks) <= MOST_CELLS and numbers(*ranks, channels) <= budget)
+        cells = int(np.prod(ranks)) * channels
+        return numbers(*ranks, channels, int(KEPT * cells) + num_words(cells))
+
+    def fits(factors, channels: int) -> bool:
+        return bool(np.prod([f.shape[1] for f in factors]) <= MOST_CELLS and expected(factors, channels) <= budget)
 
     while True:
         solved = fit.solve_core(*factors[:2], fit.project(factors[2]))
@@ -45,7 +54,7 @@ def grow(
         enough = is_enough(found)
         if error <= NO_ERROR * energy or enough:
             break
-        held, steps = numbers(*found.ranks, channels), []
+        held, steps = expected(factors, channels), []
         for step in _steps(fit, found, len(solved.gain)):
             trial = step.taken(factors, channels)
             if not fits(*trial):
@@ -55,8 +64,7 @@ def grow(
             else:
                 gained = fit.added_gain(solved, factors, step.mode, step.factor)[:channels].sum()
             if gained >= LEAST_GAIN * error:
-                cost = numbers(*(f.shape[1] for f in trial[0]), trial[1]) - held
-                steps.append((_score(error, gained, cost), step))
+                steps.append((_score(error, gained, expected(*trial) - held), step))
         if not steps:
             break
         steps.sort(key=lambda pair: -pair[0])
@@ -67,7 +75,11 @@ def grow(
         factors, _ = fit.sweep(factors, channels)
     factors = _settle(fit, factors, channels)
     settled = Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2])).value[..., :channels])
-    return found if enough and not is_enough(settled) else settled  # settled for all, not for the worst
+    if enough and not is_enough(settled):
+        settled = found  # settled for all, not for the worst
+    cells = np.size(settled.core)
+    most = min(cells, budget - numbers(*settled.ranks, channels, num_words(cells)))
+    return prune(fit, settled, max(int(most), 1), is_enough)
 
 
 class _Step(NamedTuple):
