@@ -169,7 +169,10 @@ def measure(name: str, *, with_paper: bool) -> dict[str, list[tuple[float, float
                     (between["relative_error_between_theta_i"], known[:-1] & known[1:]),
                 )]  # fmt: skip
                 colour = np.median(at_nodes["delta_e_median"][known])
-                more += f"between {off[0]:.2f}, between theta_i {off[1]:.2f}, Delta E {colour:.2f}"
+                more += f"between {off[0]:.2f}, between theta_i {off[1]:.2f}, "
+                if gridded.field is not None:
+                    more += f"near mirror {100 * error_near_mirror(form, gridded, known):.2f}, "
+                more += f"Delta E {colour:.2f}"
             label = f"{method}, {storage}" if form.storage == storage else f"{method}, {storage} ({form.storage})"
             report(label, stored_numbers(form), stored_bytes(form), at_nodes["relative_error"], more)
 
@@ -194,6 +197,18 @@ def measure(name: str, *, with_paper: bool) -> dict[str, list[tuple[float, float
     leave_out(gridded, field, known)
     print(f"{time.perf_counter() - start:.0f} s", flush=True)
     return curves
+
+
+def error_near_mirror(compact, gridded, known, count: int = 5000) -> float:
+    """Median relative error over random directions some 2 degrees around the mirror's, against the field."""
+    from sbrdf_jax.evaluation import evaluate_in_chunks
+
+    rng = np.random.default_rng(0)
+    theta_i = rng.uniform(*np.asarray(gridded.theta_i)[np.flatnonzero(known)[[0, -1]]], count)
+    theta_o = np.clip(theta_i + rng.normal(0, np.radians(2), count), 0, np.radians(85))
+    phi_o = np.pi + rng.normal(0, np.radians(2), count) / np.maximum(np.sin(theta_i), np.radians(2))
+    found, field = (evaluate_in_chunks(form, theta_i, theta_o, phi_o) for form in (compact, gridded))
+    return float(np.median(np.linalg.norm(found - field, axis=1) / np.linalg.norm(field, axis=1)))
 
 
 def error_between_truth(compact, gridded, material: str) -> dict[str, np.ndarray]:

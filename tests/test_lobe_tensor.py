@@ -14,8 +14,9 @@ from sbrdf_jax import builtin, store
 from sbrdf_jax.colour import colour_matching
 from sbrdf_jax.encoding import coefficients_allowed, data_basis, decode, encode, encode_field, make_basis
 from sbrdf_jax.evaluation import evaluate, evaluate_in_chunks
+from sbrdf_jax.grid import make_grid
 from sbrdf_jax.metrics import compression, error_at_nodes, error_between, on_axes, stored_numbers
-from sbrdf_jax.options import RepresentOptions, TargetOptions
+from sbrdf_jax.options import GridOptions, RepresentOptions, ResampleOptions, TargetOptions
 from sbrdf_jax.records import GriddedBRDF, SpectralField, Status
 from sbrdf_jax.representation import represent, represent_with_plan
 from sbrdf_jax.representation.direction_functions import direction_functions, num_direction_functions
@@ -23,6 +24,7 @@ from sbrdf_jax.representation.tensor_fit import Factors, Normal, TensorFit
 from sbrdf_jax.representation.tensor_growth import grow
 from sbrdf_jax.representation.tensor_pruning import prune
 from sbrdf_jax.representation.tensor_value import pad_ranks
+from sbrdf_jax.resampling import resample
 from sbrdf_jax.splines import spline_weights
 
 ROUND = tolerance(ROUNDING, np.float64)
@@ -218,6 +220,20 @@ def test_a_sharp_lobe_costs_few_numbers_at_the_nodes_and_between_them(amber):
     mesh = np.meshgrid(theta_i, theta_o, phi_o, indexing="ij")
     error = np.linalg.norm(evaluate_in_chunks(found, *mesh) - expected) / np.linalg.norm(expected)
     assert error < 0.15  # on a grid of 15 degrees, between which the field is guessed
+
+
+def test_near_the_mirror_direction_it_is_the_field_between_nodes_too(rng):
+    samples = builtin.measure("amber_glass", count=400)
+    samples = dataclasses.replace(samples, value=samples.value[:, ::20], wavelength_nm=samples.wavelength_nm[::20])
+    gridded = resample(samples, make_grid(samples, GridOptions(), bilateral=True), ResampleOptions(tolerance=1e-8))
+    field = encode_field(gridded, data_basis(gridded.wavelength_nm, np.asarray(gridded.brdf)[1:-1], 3))
+    found = represent(field, options(numbers=120), gridded)
+    theta_i = rng.uniform(0.2, 1.3, 2000)
+    theta_o, phi_o = theta_i + rng.normal(0, 0.03, 2000), np.pi + rng.normal(0, 0.03, 2000) / np.sin(theta_i)
+    expected = evaluate_in_chunks(gridded, theta_i, theta_o, phi_o)
+    error = np.linalg.norm(evaluate_in_chunks(found, theta_i, theta_o, phi_o) - expected, axis=1)
+    relative = error / np.linalg.norm(expected, axis=1)
+    assert np.median(relative) < 0.01 and np.quantile(relative, 0.9) < 0.05
 
 
 def test_never_negative_and_finite_with_gradients_everywhere(amber, rng):

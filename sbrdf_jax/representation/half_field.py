@@ -3,6 +3,7 @@
 SciPy's interpolation and images take half a second to import, and few runs need them: functions import them.
 """
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -15,9 +16,15 @@ from sbrdf_jax.records import GriddedBRDF, SpectralField
 SKIPPED_WEIGHT = 1e-3  # of a node that no scene needs: it has its neighbour's value, and is not to run wild
 UNKNOWN_WEIGHT = 0.01  # of an incident angle without data: it does not count, but is not to run wild
 BETWEEN_WEIGHT = 0.03  # of the error between the nodes, beside that at them, where the field is known there
+MIRROR_WEIGHT = 0.02  # of the error near the mirror direction, closer to it than any node or midpoint but its own
+NEAR_MIRROR = np.array([2 / 3, 1 / 3, 1 / 6, 1 / 12, 1 / 24, 0.0])  # steps of phi_o off the plane of incidence
 GUESS_WEIGHT = 1e-3  # where it is interpolated: enough that nothing runs wild
+MIDWAY_WEIGHT = 0.1  # where it is interpolated midway between incident angles: a better guess than splines
 RELATIVE_SHARE = 0.03  # of the error relative to each direction's own energy
 RELATIVE_FLOOR = 1e-3  # of the mean energy of a direction
+SLACK = 1e-9  # rad
+SMOOTH = 1e-3  # of a logarithm: what is as even as that is even
+GRAZING = np.radians(85.0)  # beyond it nothing moves: cosines are floored there
 SMALLEST = 1e-9  # of the largest value; logarithms of less are not taken
 
 
@@ -33,7 +40,7 @@ class Block(NamedTuple):
 
 
 class HalfField(NamedTuple):
-    """The nodes, then the midpoints of theta_o and phi_o, then, of a field, these midway between incident angles."""
+    """The nodes, then the midpoints of theta_o and phi_o at their incident angles, then what lies elsewhere between."""
 
     blocks: tuple[Block, ...]
     known: Bool[np.ndarray, " theta_i"]  # incident angles that count: finite, not zero throughout, and with data
@@ -80,29 +87,42 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
     needed = needed[place]
     nodes = _block(theta_i[place], theta_o, phi_o[:count], even[place], weight, share, needed)
     mid_o, mid_phi = midpoints(theta_o), midpoints(phi_o[:count])
-    twins = np.full(len(mid_phi), 2.0)
+    every_o = np.sort(np.concatenate([theta_o, mid_o]))
+    near = np.pi - np.diff(phi_o).mean() * NEAR_MIRROR
     less = np.minimum(share[:-1], share[1:])
+    blocks = [nodes]
+
+    def add(theta_i, theta_o, phi_o, brdf, share, needed=None) -> None:
+        twins = np.where(np.isclose(phi_o, np.pi), 1.0, 2.0)
+        needed = np.ones(brdf.shape[:3], bool) if needed is None else needed
+        blocks.append(_block(theta_i, theta_o, phi_o, brdf, twins, share, needed))
+
     if gridded is None or gridded.field is None:
-        between = _interpolate_logarithm(nodes, mid_o, mid_phi)
-        every = np.ones(between.shape[:3], bool)
-        blocks = [nodes, _block(nodes.theta_i, mid_o, mid_phi, between, twins, GUESS_WEIGHT * share, every)]
+        for at_o, at_phi in ((mid_o, mid_phi), (every_o, near)):
+            add(nodes.theta_i, at_o, at_phi, _interpolate_logarithm(nodes, at_o, at_phi), GUESS_WEIGHT * share)
         if field.interpolate_theta_i and len(nodes.theta_i) > 1:
             phi = np.sort(np.concatenate([nodes.phi_o, mid_phi]))
-            tracked, brdf = _along_mirror_track(nodes, phi)
-            both = np.where(np.arange(len(phi)) == len(phi) - 1, 1.0, 2.0)
-            every = np.ones(brdf.shape[:3], bool)
-            blocks.append(_block(midpoints(nodes.theta_i), tracked, phi, brdf, both, GUESS_WEIGHT * less, every))
+            add(midpoints(nodes.theta_i), *_between_incident_angles(nodes, phi), MIDWAY_WEIGHT * less)
         return HalfField(tuple(blocks), known, asymmetry)
     finite = np.isin(np.asarray(gridded.field.wavelength_nm), np.asarray(field.basis.wavelength_nm))
-    mid_i = midpoints(nodes.theta_i) if field.interpolate_theta_i else np.empty(0)
-    cell = cells_between(needed)
-    between = _evaluate_needed(gridded, nodes.theta_i, mid_o, mid_phi, cell)[..., finite]
-    blocks = [nodes, _block(nodes.theta_i, mid_o, mid_phi, between, twins, BETWEEN_WEIGHT * share, cell)]
-    if len(mid_i):
-        cell = cell[:-1] & cell[1:]
-        between = _evaluate_needed(gridded, mid_i, mid_o, mid_phi, cell)[..., finite]
-        blocks.append(_block(mid_i, mid_o, mid_phi, between, twins, BETWEEN_WEIGHT * less, cell))
+    cell, beside = cells_between(needed), _beside_mirror(needed)
+    rows = [(nodes.theta_i, share, cell, beside)]
+    if field.interpolate_theta_i and len(nodes.theta_i) > 1:
+        rows.append((midpoints(nodes.theta_i), less, cell[:-1] & cell[1:], beside[:-1] & beside[1:]))
+    for kind, (at_o, at_phi, part) in enumerate(((mid_o, mid_phi, BETWEEN_WEIGHT), (every_o, near, MIRROR_WEIGHT))):
+        for at_i, weight, *masks in rows:
+            mask = masks[kind]
+            brdf = _evaluate_needed(gridded, at_i, at_o, at_phi, mask)[..., finite]
+            add(at_i, at_o, at_phi, brdf, part * weight, mask)
     return HalfField(tuple(blocks), known, asymmetry, is_field=True)
+
+
+def _beside_mirror(needed: Bool[np.ndarray, "i o p"]) -> Bool[np.ndarray, "i between near"]:
+    """Which nodes and midpoints of theta_o have needed nodes around them next to the plane of incidence."""
+    nodes = needed[:, :, -1] & needed[:, :, -2]
+    mask = np.zeros((len(nodes), 2 * nodes.shape[1] - 1), bool)
+    mask[:, ::2], mask[:, 1::2] = nodes, nodes[:, :-1] & nodes[:, 1:]
+    return np.repeat(mask[:, :, None], len(NEAR_MIRROR), axis=2)
 
 
 def cells_between(needed: Bool[np.ndarray, "i o p"]) -> Bool[np.ndarray, "i o-1 p-1"]:
@@ -165,28 +185,62 @@ def _interpolate_logarithm(nodes: Block, theta_o, phi_o):
     return np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))
 
 
-def _along_mirror_track(nodes: Block, phi_o) -> tuple[np.ndarray, np.ndarray]:
-    """Return theta_o and values midway between incident angles: cubics through logarithms of four neighbours.
+def _between_incident_angles(nodes: Block, phi_o) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return theta_o, phi_o and values midway between incident angles, by polynomials through up to six logarithms.
 
-    theta_o moves with theta_i from neighbour to neighbour, so a peak that moves with its mirror
-    direction stays one peak. Where one of the outer two does not exist, the inner two alone.
+    On one path theta_o stays, as does what is broad; on the other it moves with theta_i, so that a peak that moves
+    with its mirror direction stays one peak. Of the two, the one that is smoother around a direction counts most.
     """
     from scipy.interpolate import PchipInterpolator
+    from scipy.ndimage import maximum_filter1d
 
-    step, last, slack = np.diff(nodes.theta_i).mean(), nodes.theta_o[-1], 1e-9
-    first = nodes.theta_o[nodes.theta_o + step <= last + slack]
-    along = PchipInterpolator(nodes.theta_o, _logarithm(nodes), axis=1)
+    step = np.diff(nodes.theta_i).mean()
+    inner = nodes.theta_o[nodes.theta_o + step <= nodes.theta_o[-1] + SLACK] + step / 2  # both paths meet nodes there
+    theta_o = np.unique(np.concatenate([inner, nodes.theta_o[[0, -1]]]))
+    logarithm = _logarithm(nodes)
+    if nodes.theta_i[0] < SLACK:  # beyond the normal is the other side, seen from behind
+        logarithm = np.concatenate([logarithm[2:0:-1, :, ::-1], logarithm])
+    along = PchipInterpolator(nodes.theta_o, logarithm, axis=1)
+    above = np.arange(len(nodes.theta_i) - 1) + len(logarithm) - len(nodes.theta_i) + 1  # places of the next ones
+    stay, rough = _along_path(along, above, theta_o, 0.0, nodes.theta_o[-1])
+    move, uneven = _along_path(along, above, theta_o, step, GRAZING)
+    size = 1 + 2 * round(step / np.diff(nodes.theta_o).mean())
+    rough, uneven = (maximum_filter1d(np.nan_to_num(error), size, axis=1) + SMOOTH for error in (rough, uneven))
+    share = np.where(np.isfinite(move), 1 / (1 + (uneven / rough) ** 4), 0.0)
+    value = stay + share * (np.nan_to_num(move) - stay)
+    return theta_o, phi_o, np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))
 
-    def neighbour(number):  # of each midway angle, by its place before or behind; nan where there is none
-        theta_o = first + number * step
-        value = along(np.clip(theta_o, 0.0, last))
-        value[:, (theta_o < -slack) | (theta_o > last + slack)] = np.nan
-        place = np.arange(len(nodes.theta_i) - 1) + number
-        outside = (place < 0) | (place >= len(nodes.theta_i))
-        return np.where(outside[:, None, None, None], np.nan, value[np.clip(place, 0, len(nodes.theta_i) - 1)])
 
-    before, below, above, behind = (neighbour(number) for number in (-1, 0, 1, 2))
-    linear = (below + above) / 2
-    cubic = linear + (below + above - before - behind) / 16
-    value = np.where(np.isnan(cubic), linear, cubic)
-    return first + step / 2, np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))
+def _along_path(along, above, theta_o, step: float, last: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return values midway between rows and how far they may be off: what the last of six rows adds; nan where none is.
+
+    Args:
+        along: Rows by theta_o.
+        above: The row after each midway one.
+        theta_o: Where the path is midway.
+        step: By how much theta_o moves from row to row.
+        last: Of theta_o on a path.
+    """
+    num_rows, six = len(along(0.0)), []
+    for number in range(-3, 3):
+        at, row = theta_o + (number + 0.5) * step, above + number
+        value = along(np.clip(at, 0.0, last))[np.clip(row, 0, num_rows - 1)]
+        value[:, (at < -SLACK) | (at > last + SLACK)] = np.nan
+        value[(row < 0) | (row >= num_rows)] = np.nan
+        six.append(value)
+    values = np.stack(six)
+    exists, filled = np.isfinite(values), np.nan_to_num(values)
+    value, error = (values[2] + values[3]) / 2, np.abs(values[3] - values[2])
+    for first, end in ((2, 5), (1, 4), (1, 5), (0, 4), (2, 6), (0, 5), (1, 6), (0, 6)):  # the last that exist are best
+        more = exists[first:end].all(axis=0)
+        better = np.tensordot(_midway_weights(first, end), filled[first:end], 1)
+        error = np.where(more, np.abs(better - value), error)
+        value = np.where(more, better, value)
+    return value, error.mean(axis=-1, keepdims=True)
+
+
+@functools.cache
+def _midway_weights(first: int, end: int) -> np.ndarray:
+    """Return the weights by which a polynomial through those of six equidistant values is read midway of the six."""
+    position = np.arange(first, end) - 2.5
+    return np.linalg.solve(np.vander(position, increasing=True).T, np.eye(len(position))[0])

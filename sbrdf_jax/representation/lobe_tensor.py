@@ -97,7 +97,7 @@ def represent(
     else:
         ends = theta_i[[0, -1]]
     num_rows = len(half.nodes.theta_i) if half.blocks else len(theta_i)
-    num_i = min(num_rows, MOST_FUNCTIONS) if field.interpolate_theta_i else len(theta_i)
+    num_i = min(2 * num_rows - 1, MOST_FUNCTIONS) if field.interpolate_theta_i else len(theta_i)
     functions = num_i, min(len(theta_o), MOST_FUNCTIONS), num_direction_functions(floor)
     num_wavelengths = np.size(field.basis.wavelength_nm)
     layout = Layout(len(theta_i), functions, num_wavelengths, field.basis.kind == "data")
@@ -142,8 +142,8 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
 
     energy = np.einsum("iopw,iopw->i", half.nodes.brdf, half.nodes.brdf)
     scaled = np.flatnonzero(energy > 0)
-    at_nodes = at_rows[np.searchsorted(rows, half.nodes.theta_i)]
-    log_scale = np.linalg.lstsq(at_nodes[scaled], -0.5 * np.log(energy[scaled]))[0]
+    log_energy = np.interp(rows, half.nodes.theta_i[scaled], np.log(energy[scaled]))
+    log_scale = np.linalg.lstsq(at_rows, -0.5 * log_energy)[0]
     scale = np.exp(at_rows @ log_scale)
 
     size, count = layout.functions[2], len(vectors)
@@ -157,8 +157,8 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
             weight = (block.weight[i] / scale[row] ** 2)[..., None]
             weighted = np.swapaxes(function * weight, 1, 2)
             value = scale[row] * (block.brdf[i] @ vectors.T)
-            gram[row, o] = weighted @ function
-            moment[row, o] = weighted @ value
+            gram[row, o] += weighted @ function
+            moment[row, o] += weighted @ value
             total += float((weight * value**2).sum())
     fit = TensorFit(Normal(gram, moment, total, at_rows, at_columns))
 

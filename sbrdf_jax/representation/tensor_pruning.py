@@ -83,15 +83,16 @@ class _Thinning:
         np.put(self.kept, np.argpartition(loss, -count, axis=None)[-count:], True)
         self._value, self._roots = np.zeros(loss.shape), []
         for channel, kept in enumerate(self.kept.T):
-            root = _cholesky(self._problem.matrix[np.ix_(kept, kept)])
-            self._value[kept, channel] = scipy.linalg.lapack.dpotrs(root, self._problem.right[kept, channel], lower=1)[
-                0
-            ]
+            root = np.zeros((0, 0))
+            if kept.any():
+                root = _cholesky(self._problem.matrix[np.ix_(kept, kept)])
+                right = self._problem.right[kept, channel]
+                self._value[kept, channel] = scipy.linalg.lapack.dpotrs(root, right, lower=1)[0]
             self._roots.append(root)
 
     def _losses(self) -> Float[np.ndarray, "cell channel"]:
         """Return by how much the squared error grows without each cell, all others solved anew; -1 without it now."""
-        inverse = [np.diag(scipy.linalg.lapack.dpotri(root, lower=1)[0]) for root in self._roots]
+        inverse = [np.diag(scipy.linalg.lapack.dpotri(root, lower=1)[0]) if root.size else [] for root in self._roots]
         loss = np.full(self.kept.shape, -1.0)
         for channel, (kept, diagonal) in enumerate(zip(self.kept.T, itertools.cycle(inverse), strict=False)):
             loss[kept, channel] = self._value[kept, channel] ** 2 / diagonal
