@@ -148,7 +148,12 @@ def midpoints(axis) -> np.ndarray:
 
 def has_data(gridded: GriddedBRDF) -> np.ndarray:
     """Mask [theta_i] of the incident angles with a node that is not beyond the measured range."""
-    return ~np.all(np.asarray(gridded.extrapolated) == 2, axis=(1, 2))
+    return angles_with_data(np.asarray(gridded.extrapolated))
+
+
+def angles_with_data(extrapolated: np.ndarray) -> np.ndarray:
+    """`has_data` from `extrapolated` [theta_i, theta_o, phi_o] alone."""
+    return (extrapolated != 2).any(axis=(1, 2))
 
 
 def _quarter_circle(step_deg: float) -> np.ndarray:

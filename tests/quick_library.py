@@ -62,7 +62,8 @@ def write_result(material: Material, text: str = "") -> None:
         value = np.full((3, 2, 2, 4), float(len(material.name)))
         file.create_dataset("grid/brdf", data=value, chunks=(1, 2, 2, 4), fletcher32=True)
         file["grid/status"] = np.array([int(text == "lane"), 0, 0, 0])
-        file["metrics/relative_error"] = np.array([0.01, 0.25])
+        file["metrics/relative_error"] = np.array([0.01, 0.25, 0.9])
+        file["grid/extrapolated"] = np.repeat([0, 1, 2], 4).reshape(3, 2, 2)  # the last incident angle has no data
         file["timing/resample/total"], file["timing/resample/compile"] = 1.5, 0.5
         file.flush()
         time.sleep(float(text.removeprefix("slow ")) if text.startswith("slow ") else 0.0)

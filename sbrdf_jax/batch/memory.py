@@ -14,6 +14,7 @@ import numpy as np
 
 from sbrdf_jax.config import BUILTIN, config_sha256, parse_config
 from sbrdf_jax.errors import UserError
+from sbrdf_jax.grid import angles_with_data
 from sbrdf_jax.hdf5 import attribute, one_line_errors
 from sbrdf_jax.options import OutputOptions, RunOptions
 from sbrdf_jax.schema import open_result
@@ -32,7 +33,7 @@ class Checked(NamedTuple):
     failed_lanes: int
     seconds: float
     compile_seconds: float
-    worst_error: float  # relative, of the compact form, over incident angles; nan where there is none
+    worst_error: float  # relative, of the compact form, over incident angles with data; nan where there is none
     created_utc: str
     layout: str  # JSON: shape and type of each dataset that the index stacks
 
@@ -109,11 +110,12 @@ def check_result(path: Path) -> Checked:
         UserError: It is damaged, or no result.
     """
     layout: dict[str, tuple[list[int], str]] = {}
-    failed, worst, seconds = 0, np.nan, {"total": 0.0, "compile": 0.0}
+    failed, seconds = 0, {"total": 0.0, "compile": 0.0}
+    counted: dict[str, np.ndarray] = {}
     with open_result(path) as file:
 
         def visit(path: bytes) -> None:
-            nonlocal failed, worst
+            nonlocal failed
             item, name = h5py.h5o.open(file.id, path), path.decode()  # in half of the time of `visititems`
             if not isinstance(item, h5py.h5d.DatasetID):
                 return
@@ -125,8 +127,8 @@ def check_result(path: Path) -> Checked:
                 layout[name] = (list(item.shape), item.dtype.str)
             if last == "status":
                 failed += int(np.isin(value, _FAILED).sum())
-            if name == "metrics/relative_error":
-                worst = float(np.max(value, initial=0.0))
+            if name in ("metrics/relative_error", "grid/extrapolated"):
+                counted[name] = value
             if group == "timing" and last in seconds:
                 seconds[last] += float(value)
 
@@ -137,10 +139,18 @@ def check_result(path: Path) -> Checked:
             failed_lanes=failed,
             seconds=seconds["total"],
             compile_seconds=seconds["compile"],
-            worst_error=worst,
+            worst_error=_worst_error(**{name.split("/")[1]: value for name, value in counted.items()}),
             created_utc=str(attribute(file, "created_utc")),
             layout=json.dumps(layout),
         )
+
+
+def _worst_error(relative_error: np.ndarray | None = None, extrapolated: np.ndarray | None = None) -> float:
+    """Return the worst error of the incident angles with data; nan where none was measured."""
+    if relative_error is None:
+        return np.nan
+    known = slice(None) if extrapolated is None else angles_with_data(extrapolated)
+    return float(np.max(relative_error[known], initial=0.0))
 
 
 @functools.lru_cache(maxsize=1024)

@@ -39,7 +39,7 @@ class Outcome:
     seconds: float = 0.0
     compile_seconds: float = 0.0
     cpu_seconds: float = 0.0
-    worst_error: float = math.nan  # relative, of the compact form, over incident angles
+    worst_error: float = math.nan  # relative, of the compact form, over incident angles with data
     computed: bool = False
     result: Seen | None = None  # what its process has read, so that others need not
     source: Seen | None = None
