@@ -4,12 +4,12 @@ Factors are first turned so that the core's energy gathers in few cells; then ce
 rounds, and what is left is solved anew after each. A bit for each cell says where the stored ones lie.
 """
 
-import itertools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg.lapack
-from jaxtyping import Bool, Float
+import scipy.linalg
+from jaxtyping import Bool, Float, Int
 
 from sbrdf_jax.representation.tensor_fit import Factors, TensorFit
 
@@ -60,52 +60,53 @@ def _turned(factors: Factors) -> Factors:
     return Factors(*turned, core)
 
 
-class _Thinning:
-    """A core that loses cells; `kept` says which it has."""
+class _Channel(NamedTuple):
+    """The cells that a channel has left."""
 
-    kept: Bool[np.ndarray, "cell channel"]
+    cells: Int[np.ndarray, " left"]
+    value: Float[np.ndarray, " left"]  # of the scaled problem
+    inverse: Float[np.ndarray, "left left"]  # of its matrix
+
+    @property
+    def loss(self) -> Float[np.ndarray, " left"]:
+        """By how much the squared error grows without each cell, all others solved anew."""
+        return self.value**2 / np.diag(self.inverse)
+
+    def without(self, lost: Bool[np.ndarray, " left"]) -> "_Channel":
+        """Take cells away and solve for the others anew, by a Schur complement of the inverse."""
+        left, across = ~lost, self.inverse[np.ix_(lost, ~lost)]
+        shares = scipy.linalg.solve(self.inverse[np.ix_(lost, lost)], across, assume_a="pos", check_finite=False)
+        inverse = self.inverse[np.ix_(left, left)] - across.T @ shares
+        return _Channel(self.cells[left], self.value[left] - self.value[lost] @ shares, inverse)
+
+
+class _Thinning:
+    """A core that loses cells."""
 
     def __init__(self, fit: TensorFit, factors: Factors):
-        self._factors, self._problem = factors, fit.core_problem(factors)
-        self.kept = np.ones((len(self._problem.scale), factors.core.shape[3]), bool)
-        self._value = factors.core.reshape(self.kept.shape) / self._problem.scale[:, None]
-        self._roots = [_cholesky(self._problem.matrix)]  # of each channel's cells that are left; one for all at first
+        matrix, _, self._scale = fit.core_problem(factors)
+        self._factors = factors
+        inverse = np.linalg.inv(matrix)
+        values = factors.core.reshape(len(matrix), -1) / self._scale[:, None]
+        self._channels = [_Channel(np.arange(len(matrix)), value, inverse) for value in values.T]
 
     @property
     def count(self) -> int:
         """Number of cells left."""
-        return int(self.kept.sum())
+        return sum(len(channel.cells) for channel in self._channels)
 
     def thin(self, count: int) -> None:
-        """Keep the `count` cells whose loss is greatest, and solve for them again."""
-        loss = self._losses()
-        self.kept = np.zeros(loss.shape, bool)
-        np.put(self.kept, np.argpartition(loss, -count, axis=None)[-count:], True)
-        self._value, self._roots = np.zeros(loss.shape), []
-        for channel, kept in enumerate(self.kept.T):
-            root = np.zeros((0, 0))
-            if kept.any():
-                root = _cholesky(self._problem.matrix[np.ix_(kept, kept)])
-                right = self._problem.right[kept, channel]
-                self._value[kept, channel] = scipy.linalg.lapack.dpotrs(root, right, lower=1)[0]
-            self._roots.append(root)
-
-    def _losses(self) -> Float[np.ndarray, "cell channel"]:
-        """Return by how much the squared error grows without each cell, all others solved anew; -1 without it now."""
-        inverse = [np.diag(scipy.linalg.lapack.dpotri(root, lower=1)[0]) if root.size else [] for root in self._roots]
-        loss = np.full(self.kept.shape, -1.0)
-        for channel, (kept, diagonal) in enumerate(zip(self.kept.T, itertools.cycle(inverse), strict=False)):
-            loss[kept, channel] = self._value[kept, channel] ** 2 / diagonal
-        return loss
+        """Keep the `count` cells whose loss is greatest."""
+        loss = np.concatenate([channel.loss for channel in self._channels])
+        lost = np.ones(len(loss), bool)
+        lost[np.argpartition(loss, -count)[-count:]] = False
+        ends = np.cumsum([len(channel.cells) for channel in self._channels])[:-1]
+        pairs = zip(self._channels, np.split(lost, ends), strict=True)
+        self._channels = [channel.without(gone) if gone.any() else channel for channel, gone in pairs]
 
     def factors(self) -> Factors:
         """Return the factors with the core as it is now."""
-        core = self._value * self._problem.scale[:, None]
+        core = np.zeros((len(self._scale), len(self._channels)))
+        for column, channel in zip(core.T, self._channels, strict=True):
+            column[channel.cells] = channel.value * self._scale[channel.cells]
         return self._factors._replace(core=core.reshape(self._factors.core.shape))
-
-
-def _cholesky(matrix):
-    root, failed = scipy.linalg.lapack.dpotrf(matrix, lower=1)
-    if failed:
-        raise np.linalg.LinAlgError("normal equations are not positive definite")
-    return root
