@@ -20,6 +20,7 @@ from sbrdf_jax.options import GridOptions, RepresentOptions, ResampleOptions, Ta
 from sbrdf_jax.records import GriddedBRDF, SpectralField, Status
 from sbrdf_jax.representation import represent, represent_with_plan
 from sbrdf_jax.representation.direction_functions import direction_functions, num_direction_functions
+from sbrdf_jax.representation.half_field import half_field
 from sbrdf_jax.representation.tensor_fit import Factors, Normal, TensorFit
 from sbrdf_jax.representation.tensor_growth import grow
 from sbrdf_jax.representation.tensor_pruning import prune
@@ -220,6 +221,25 @@ def test_a_sharp_lobe_costs_few_numbers_at_the_nodes_and_between_them(amber):
     mesh = np.meshgrid(theta_i, theta_o, phi_o, indexing="ij")
     error = np.linalg.norm(evaluate_in_chunks(found, *mesh) - expected) / np.linalg.norm(expected)
     assert error < 0.15  # on a grid of 15 degrees, between which the field is guessed
+
+
+@pytest.mark.parametrize(("lobe", "allowed"), [(0.0, 3e-4), (3.0, 0.02)], ids=["broad", "with a peak between nodes"])
+def test_midway_between_incident_angles_what_is_broad_stays_and_a_peak_moves_on(lobe, allowed):
+    def planted(theta_i, theta_o, phi_o):
+        i, o, p = np.meshgrid(theta_i, theta_o, phi_o, indexing="ij")
+        toward = np.sin(i) ** 2 + np.sin(o) ** 2 + 2 * np.sin(i) * np.sin(o) * np.cos(p)
+        diffuse = np.exp(-0.3 * i**2 - 0.2 * o**2)
+        return (diffuse + lobe * np.exp(-toward / 0.02))[..., None] * np.linspace(1.0, 2.0, len(WAVELENGTH_NM))
+
+    gridded = grid_of(planted(THETA, THETA, PHI))
+    midway = half_field(field_of(gridded), gridded.brdf, gridded).blocks[-1]
+    np.testing.assert_allclose(midway.theta_i, THETA[:-1] + np.radians(7.5))
+    inner = slice(1, -2)  # five incident angles or more around
+    expected = planted(midway.theta_i, midway.theta_o, midway.phi_o)[inner]
+    rows = np.abs(midway.theta_o - np.pi / 4) < np.radians(25)
+    at_nodes = np.isin(midway.phi_o, PHI)
+    error = (midway.brdf[inner] - expected)[:, rows][:, :, at_nodes]
+    assert np.linalg.norm(error) < allowed * np.linalg.norm(expected[:, rows][:, :, at_nodes])
 
 
 def test_near_the_mirror_direction_it_is_the_field_between_nodes_too(rng):
