@@ -42,7 +42,14 @@ from sbrdf_jax.resampling.guided.covariance import (
     node_values,
     prior_variance,
 )
-from sbrdf_jax.resampling.guided.error_model import MAX_FACTOR, estimate_floor, noise_factors
+from sbrdf_jax.resampling.guided.error_model import (
+    MAX_FACTOR,
+    ResidualScale,
+    between_scale,
+    estimate_floor,
+    fit_between_scale,
+    noise_factors,
+)
 from sbrdf_jax.resampling.guided.field import evaluate_on_axes as field_on_axes
 from sbrdf_jax.resampling.guided.field import evaluate_with_error, evaluated_part, field_whitener
 from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out, lower_inverse, mirror_lower
@@ -508,6 +515,19 @@ def test_a_result_holds_the_field_and_its_errors(samples, tmp_path, rng):
     kept = dataclasses.replace(grid.field, lobe=lobe, difference=np.zeros_like(grid.field.difference))
     expected = evaluate_in_chunks(kept, *nodes)
     np.testing.assert_allclose(evaluate_in_chunks(load_stage(path, "grid"), *nodes), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_a_standard_error_grows_between_incident_angles_as_left_out_ones_need(rng):
+    theta_i, wrong_by = np.radians([10.0, 30.0, 70.0]), np.array([2.0, 4.0, 1.0])
+    ratios = [factor**2 * rng.normal(size=20_000) ** 2 for factor in wrong_by]
+    scale = ResidualScale(np.zeros((2, 2, 2)), np.zeros(3), np.ones(3), **fit_between_scale(theta_i, ratios))
+    at = np.radians([0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 50.0, 70.0, 90.0])
+    middle, last = np.sqrt(2.0 * 4.0), np.sqrt(4.0 * 1.0)
+    expected = [2.0, np.sqrt(2.0), 1.0, np.sqrt(middle), middle, 1.0, last, 1.0, 1.0]
+    np.testing.assert_allclose(between_scale(scale, at), expected, rtol=0.03)
+    np.testing.assert_allclose(between_scale(scale, jnp.asarray(at)), between_scale(scale, at), rtol=1e-12)
+    assert fit_between_scale(theta_i[:1], ratios[:1]) == {}
+    np.testing.assert_array_equal(between_scale(ResidualScale(np.zeros((2, 2, 2)), np.zeros(3), np.ones(3)), at), 1.0)
 
 
 def test_held_out_samples_of_a_measured_paint(shared):

@@ -1,5 +1,6 @@
 """What the data say about their own errors: floor, drop-outs, and the local scale of the residuals."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ SAMPLES_OF_SPECTRUM = 8
 COVERED = 0.6827
 SORTED_TOGETHER = 256  # residuals whose weights are summed before the sum is looked into
 NO_WEIGHT = 1e-9
+BETWEEN = (0.3, 10.0)  # bounds of what a standard error grows by between measured incident angles
 TABLE_WIDTH = 0.6  # nodes of the table over which residuals are pooled
 
 
@@ -86,6 +88,9 @@ class ResidualScale:
     log_scale: Any  # [theta_i, half, z]
     start: Any  # [3]
     step: Any  # [3]
+    # what a standard error grows by between incident angles; nothing in results of earlier versions
+    between_theta_i: Any = dataclasses.field(default_factory=lambda: np.zeros(1))  # [knot] rad
+    between_log_scale: Any = dataclasses.field(default_factory=lambda: np.zeros(1))  # [knot]
 
 
 def fit_residual_scale(
@@ -128,6 +133,35 @@ def fit_residual_scale(
         missing = wanted - (before[part - 1, i, j, k] if part else 0.0)
         table[i, j, k] = size[parts[part]][min(int(np.searchsorted(own, missing)), len(own) - 1)]
     return ResidualScale(log_scale=np.log(np.maximum(table, 1e-6)), start=start, step=step)
+
+
+def fit_between_scale(theta_i: Float[np.ndarray, " group"], ratios: list[np.ndarray]) -> dict[str, np.ndarray]:
+    """Calibrate what lies between measured incident angles, by incident angles that were left out.
+
+    Args:
+        theta_i: Measured incident angles, increasing [rad].
+        ratios: For each, the squares of its residuals when it is left out, over what they were expected to be.
+
+    Returns:
+        Knots of `between_scale`: 1 at the measured angles; midway, and as far beyond the first and the last, what 68 %
+        of the residuals need.
+    """
+    if len(theta_i) < 2:
+        return {}
+    needed = [np.sqrt(np.quantile(ratio, COVERED)) if len(ratio) else 1.0 for ratio in ratios]
+    log_scale = np.log(np.clip(needed, *BETWEEN))
+    gap = np.diff(theta_i) / 2
+    beyond = np.concatenate([theta_i[:1] - gap[:1], theta_i[:-1] + gap, theta_i[-1:] + gap[-1:]])
+    there = np.concatenate([log_scale[:1], (log_scale[:-1] + log_scale[1:]) / 2, log_scale[-1:]])
+    knots, values = np.concatenate([beyond, theta_i]), np.concatenate([there, np.zeros(len(theta_i))])
+    order = np.argsort(knots)
+    return {"between_theta_i": knots[order], "between_log_scale": values[order]}
+
+
+def between_scale(scale: ResidualScale, theta_i: Float[AnyArray, "*direction"]) -> Float[AnyArray, "*direction"]:
+    """Interpolate by how much a standard error grows between measured incident angles."""
+    xp = array_module(theta_i, scale.between_theta_i)
+    return xp.exp(xp.interp(theta_i, scale.between_theta_i, scale.between_log_scale))
 
 
 def residual_scale(

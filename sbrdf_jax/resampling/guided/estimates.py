@@ -17,8 +17,10 @@ from sbrdf_jax.resampling.guided.coordinates import from_log, guided_coordinates
 from sbrdf_jax.resampling.guided.error_model import (
     ResidualScale,
     estimate_floor,
+    fit_between_scale,
     fit_residual_scale,
     noise_factors,
+    residual_scale,
     spread_rows,
 )
 from sbrdf_jax.resampling.guided.field import GuidedField
@@ -30,6 +32,7 @@ from sbrdf_jax.resampling.guided.smoothing import choose_smoothing
 from sbrdf_jax.resampling.guided.spectrum import SpectralFilter, spectral_filter
 
 CALIBRATION_GROUPS = 5
+TINY = 1e-12  # variance relative to the prior's
 
 
 class Estimates(NamedTuple):
@@ -106,9 +109,15 @@ def estimate(
     inverse = mirror_lower(lower)
 
     say("error scale")
-    out, variance = _left_out_fifths(seen, lower, inverse @ residual)
+    dual = inverse @ residual
+    out, variance = _left_out_fifths(seen, lower, dual)
     # a centre's own extra noise, or what averaging took from it, is not that of a new measurement
     spread = np.maximum(variance - noise, 0.0) + choice.noise
+    scale = _calibrate(centres, samples, model + residual - out, spread, floor)
+    group = np.where(seen, np.arange(centres.count) // centres.num_members, -1)
+    out, variance = leave_group_out(lower, dual, group)
+    unsure = np.maximum(variance - noise, 0.0)
+    scale = _calibrate_between(scale, centres, samples, model + residual - out, unsure, choice.noise, floor)
     return Estimates(
         wavelength_nm=samples.wavelength_nm,
         floor=floor,
@@ -121,7 +130,7 @@ def estimate(
         curve=choice.curve,
         reciprocity_cost=choice.reciprocity_cost,
         spectral_filter=spectra,
-        scale=_calibrate(centres, samples, model + residual - out, spread, floor),
+        scale=scale,
         whiten=whiten,
         inverse=inverse,
         residual=residual,
@@ -156,13 +165,33 @@ def _left_out_fifths(seen: np.ndarray, lower: np.ndarray, dual: np.ndarray) -> t
 
 def _calibrate(centres: Centres, samples: RawSamples, predicted, spread, floor: float) -> ResidualScale:
     """Calibrate the error scale by how far samples lie from predictions that did not see them."""
+    centre, z, error = _errors_of_predictions(centres, samples, predicted, floor)
+    standardised = error / np.sqrt(spread[centre])[:, None]
+    return fit_residual_scale(centres.angles[0, centre], centres.at.half[centre], z, standardised)
+
+
+def _calibrate_between(
+    scale: ResidualScale, centres: Centres, samples: RawSamples, predicted, unsure, noise: float, floor: float
+) -> ResidualScale:
+    """Calibrate it between incident angles too, by predictions that did not see a sample's incident angle."""
+    centre, z, error = _errors_of_predictions(centres, samples, predicted, floor)
+    theta_i, half = centres.angles[0, centre], centres.at.half[centre]
+    squares = (error / residual_scale(scale, theta_i, half, z)) ** 2 - noise
+    ratio = np.maximum(squares, 0.0) / np.maximum(unsure[centre], TINY)[:, None]
+    group = centre // centres.num_members
+    members = [group == number for number in np.unique(group)]
+    members.sort(key=lambda rows: np.median(theta_i[rows]))
+    angles = np.array([np.median(theta_i[rows]) for rows in members])
+    return dataclasses.replace(scale, **fit_between_scale(angles, [ratio[rows].ravel() for rows in members]))
+
+
+def _errors_of_predictions(centres: Centres, samples: RawSamples, predicted, floor: float):
+    """Return the centre of some rows, what is predicted there in z, and how far they lie from it in units of z."""
     rows = spread_rows(samples.num_samples)
     centre = centres.index[rows]
     z = predicted[centre]
     scale = log_scale(centres.at, floor)[centre]
-    value, unit = from_log(z, scale), slope(z, scale)
-    standardised = (np.maximum(samples.value[rows], 0.0) - value) / (unit * np.sqrt(spread[centre])[:, None])
-    return fit_residual_scale(centres.angles[0, centre], centres.at.half[centre], z, standardised)
+    return centre, z, (np.maximum(samples.value[rows], 0.0) - from_log(z, scale)) / slope(z, scale)
 
 
 def restore_estimates(field: GuidedField, samples: RawSamples, centres: Centres) -> Estimates:

@@ -30,7 +30,7 @@ from sbrdf_jax.resampling.guided.covariance import (
     in_chunks,
     prior_variance,
 )
-from sbrdf_jax.resampling.guided.error_model import ResidualScale, residual_scale
+from sbrdf_jax.resampling.guided.error_model import ResidualScale, between_scale, residual_scale
 from sbrdf_jax.resampling.guided.inverse import whitener
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
 from sbrdf_jax.resampling.guided.nodes import (
@@ -183,7 +183,8 @@ def _errors(field: GuidedField, at: Coordinates, z, variance):
     scale = log_scale(at, field.floor)
     xp = array_module(z, variance)
     unit = residual_scale(field.scale, at.theta_i, at.half, z) * slope(z, scale)
-    return from_log(z, scale), unit * xp.sqrt(variance)[..., None], unit * xp.sqrt(field.noise_level)
+    deviation = xp.sqrt(variance) * between_scale(field.scale, at.theta_i)
+    return from_log(z, scale), unit * deviation[..., None], unit * xp.sqrt(field.noise_level)
 
 
 @on_host
