@@ -21,7 +21,7 @@ from sbrdf_jax.grid import midpoints
 from sbrdf_jax.needs import restrict_theta_i
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, SpectralBasis, SpectralField
 from sbrdf_jax.representation import lobe_harmonics, lobe_tensor
-from sbrdf_jax.representation.half_field import HalfField, cells_between
+from sbrdf_jax.representation.half_field import HalfField, beside_mirror, cells_between, near_mirror
 from sbrdf_jax.representation.paper import compact_coefficient
 from sbrdf_jax.representation.target import PAPER_DIRECTIONS
 
@@ -194,36 +194,43 @@ def error_between(
 ) -> dict:
     """Eq. (18) at cell midpoints of theta_o and phi_o, against the grid stage there; and with theta_i midway too.
 
-    Midpoints count whose neighbours are all needed; it is nan where there are none, and midway between
-    incident angles where the grid interpolates nothing over them. What `half` holds of the grid stage is not
-    evaluated again.
+    Where the grid stage is a field, close to the mirror direction as well: at theta_o of nodes and midpoints, up to two
+    thirds of a step of phi_o off the plane of incidence. Midpoints count whose neighbours are all needed; it is nan
+    where there are none, and midway between incident angles where the grid interpolates nothing over them. What
+    `half` holds of the grid stage is not evaluated again.
     """
-    theta_i = np.asarray(gridded.theta_i)
+    theta_i, needed = np.asarray(gridded.theta_i), needed_nodes(gridded)
     theta_o, phi_o = midpoints(gridded.theta_o), midpoints(gridded.phi_o)
-    live, cell = live_wavelengths(gridded), cells_between(needed_nodes(gridded))
+    live, cell = live_wavelengths(gridded), cells_between(needed)
+    held = half.blocks if half is not None and half.is_field and live.all() else ()
 
-    known = half.blocks[1:] if half is not None and half.is_field and live.all() else ()
-
-    def grid_at(theta_i, cells):
-        for block in known:
-            if np.array_equal(block.theta_i, theta_i):
+    def grid_at(theta_i, theta_o, phi_o, cells):
+        one_side = phi_o[phi_o <= np.pi]  # the field is even
+        for block in held:
+            if all(map(np.array_equal, (block.theta_i, block.theta_o, block.phi_o), (theta_i, theta_o, one_side))):
                 twin = np.minimum(np.arange(len(phi_o)), np.arange(len(phi_o))[::-1])
-                return (value[:, twin][cell] for value, cell in zip(block.brdf, cells, strict=True) if cell.any())
+                twin = twin if len(one_side) < len(phi_o) else np.arange(len(phi_o))
+                return (value[:, twin][mask] for value, mask in zip(block.brdf, cells, strict=True) if mask.any())
         counts = cells.any(axis=(1, 2))
         return (value[:, live] for value in slices(gridded, theta_i[counts], theta_o, phi_o, cells[counts]))
 
-    def at(theta_i, cells):
+    def at(theta_i, theta_o, phi_o, cells):
         errors, counts = np.full(len(cells), np.nan), cells.any(axis=(1, 2))
-        given, wanted = (theta_i[counts], theta_o, phi_o, cells[counts]), grid_at(theta_i, cells)
-        pairs = zip(wanted, slices(compact, *given), strict=True)
+        wanted = grid_at(theta_i, theta_o, phi_o, cells)
+        found = slices(compact, theta_i[counts], theta_o, phi_o, cells[counts])
+        pairs = zip(wanted, found, strict=True)
         errors[counts] = [relative_error(((got - want) ** 2).sum(), (want**2).sum()) for want, got in pairs]
         return errors
 
     both = cell[:-1] & cell[1:] if gridded.interpolate_theta_i else np.zeros_like(cell[:-1])
-    return {
-        "relative_error_between": at(theta_i, cell),
-        "relative_error_between_theta_i": at(midpoints(theta_i), both),
+    scores = {
+        "relative_error_between": at(theta_i, theta_o, phi_o, cell),
+        "relative_error_between_theta_i": at(midpoints(theta_i), theta_o, phi_o, both),
     }
+    if gridded.field is not None:
+        beside = beside_mirror(needed[:, :, : (len(phi_o) + 2) // 2])
+        scores["relative_error_near_mirror"] = at(theta_i, *near_mirror(gridded.theta_o, gridded.phi_o), beside)
+    return scores
 
 
 def error_split(compact: CompactBRDF | LobeHarmonics | LobeTensor, field: SpectralField, gridded: GriddedBRDF) -> dict:

@@ -19,6 +19,7 @@ from sbrdf_jax.store import RunResult
 ERROR_COLUMNS = (
     ("relative_error", "eta %", 100.0),
     ("relative_error_between", "between %", 100.0),
+    ("relative_error_near_mirror", "mirror %", 100.0),
     ("error_spectral", "spectral %", 100.0),
     ("error_background", "background %", 100.0),
     ("error_lobe", "lobe %", 100.0),

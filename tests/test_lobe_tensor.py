@@ -20,7 +20,7 @@ from sbrdf_jax.options import GridOptions, RepresentOptions, ResampleOptions, Ta
 from sbrdf_jax.records import GriddedBRDF, SpectralField, Status
 from sbrdf_jax.representation import represent, represent_with_plan
 from sbrdf_jax.representation.direction_functions import direction_functions, num_direction_functions
-from sbrdf_jax.representation.half_field import half_field
+from sbrdf_jax.representation.half_field import half_field, near_mirror
 from sbrdf_jax.representation.tensor_fit import Factors, Normal, TensorFit
 from sbrdf_jax.representation.tensor_growth import grow
 from sbrdf_jax.representation.tensor_pruning import prune
@@ -247,7 +247,15 @@ def test_near_the_mirror_direction_it_is_the_field_between_nodes_too(rng):
     samples = dataclasses.replace(samples, value=samples.value[:, ::20], wavelength_nm=samples.wavelength_nm[::20])
     gridded = resample(samples, make_grid(samples, GridOptions(), bilateral=True), ResampleOptions(tolerance=1e-8))
     field = encode_field(gridded, data_basis(gridded.wavelength_nm, np.asarray(gridded.brdf)[1:-1], 3))
-    found = represent(field, options(numbers=120), gridded)
+    found, plan = represent_with_plan(field, options(numbers=120), gridded)
+    axes = near_mirror(gridded.theta_o, gridded.phi_o)
+    pairs = [(on_axes(found, at, *axes), on_axes(gridded, at, *axes)) for at in gridded.theta_i]
+    eta = [np.linalg.norm(got - wanted) / np.linalg.norm(wanted) for got, wanted in pairs]
+    for half in (None, plan["half_field"]):
+        near = error_between(found, gridded, half)["relative_error_near_mirror"]
+        np.testing.assert_allclose(near, eta, rtol=1e-6)
+    assert np.median(near) < 0.02
+
     theta_i = rng.uniform(0.2, 1.3, 2000)
     theta_o, phi_o = theta_i + rng.normal(0, 0.03, 2000), np.pi + rng.normal(0, 0.03, 2000) / np.sin(theta_i)
     expected = evaluate_in_chunks(gridded, theta_i, theta_o, phi_o)

@@ -87,8 +87,7 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
     needed = needed[place]
     nodes = _block(theta_i[place], theta_o, phi_o[:count], even[place], weight, share, needed)
     mid_o, mid_phi = midpoints(theta_o), midpoints(phi_o[:count])
-    every_o = np.sort(np.concatenate([theta_o, mid_o]))
-    near = np.pi - np.diff(phi_o).mean() * NEAR_MIRROR
+    every_o, near = near_mirror(theta_o, phi_o)
     less = np.minimum(share[:-1], share[1:])
     blocks = [nodes]
 
@@ -105,7 +104,7 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
             add(midpoints(nodes.theta_i), *_between_incident_angles(nodes, phi), MIDWAY_WEIGHT * less)
         return HalfField(tuple(blocks), known, asymmetry)
     finite = np.isin(np.asarray(gridded.field.wavelength_nm), np.asarray(field.basis.wavelength_nm))
-    cell, beside = cells_between(needed), _beside_mirror(needed)
+    cell, beside = cells_between(needed), beside_mirror(needed)
     rows = [(nodes.theta_i, share, cell, beside)]
     if field.interpolate_theta_i and len(nodes.theta_i) > 1:
         rows.append((midpoints(nodes.theta_i), less, cell[:-1] & cell[1:], beside[:-1] & beside[1:]))
@@ -117,7 +116,13 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
     return HalfField(tuple(blocks), known, asymmetry, is_field=True)
 
 
-def _beside_mirror(needed: Bool[np.ndarray, "i o p"]) -> Bool[np.ndarray, "i between near"]:
+def near_mirror(theta_o, phi_o) -> tuple[Float[np.ndarray, " between"], Float[np.ndarray, " near"]]:
+    """Return theta_o of nodes and midpoints, and azimuths close to the plane of incidence, the last one in it."""
+    every_o = np.sort(np.concatenate([theta_o, midpoints(theta_o)]))
+    return every_o, np.pi - np.diff(phi_o).mean() * NEAR_MIRROR
+
+
+def beside_mirror(needed: Bool[np.ndarray, "i o p"]) -> Bool[np.ndarray, "i between near"]:
     """Which nodes and midpoints of theta_o have needed nodes around them next to the plane of incidence."""
     nodes = needed[:, :, -1] & needed[:, :, -2]
     mask = np.zeros((len(nodes), 2 * nodes.shape[1] - 1), bool)
