@@ -123,14 +123,32 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
         share, seconds = np.array([row["share"] for row in rows]), np.array([row["next"] for row in rows])
         axes.plot([0, 1], [0, rows[0]["next"]], color=MUTED, linewidth=1, label="in proportion")
         axes.plot(share, seconds, "o", color=BLUE, label="next scene of a material, compiled")
-        for row in rows:
-            axes.annotate(row["name"], (row["share"], row["next"]), (5, 4), textcoords="offset points", fontsize=8)
         axes.set_xlabel("share of the nodes x wavelengths that the scene needs")
         axes.set_ylabel("seconds, reading to measuring")
         axes.set_ylim(bottom=0)
         axes.legend(loc="upper left")
         axes.set_title("What a scene costs")
+        _label(axes, rows)
         save_figure(figure, path)
+
+
+def _label(axes, rows: list[dict[str, Any]]) -> None:
+    """Write the names beside their points, each at the first place where it covers no other and no point."""
+    axes.figure.canvas.draw()
+    points = axes.transData.transform([(row["share"], row["next"]) for row in rows])
+    taken: list[Any] = []
+    places = [((6, height), "left") for height in (3, -9, 12, -16)] + [((-6, height), "right") for height in (3, -9)]
+    for row in sorted(rows, key=lambda row: row["share"]):
+        for offset, side in places:
+            style = {"textcoords": "offset points", "fontsize": 8, "ha": side}
+            text = axes.annotate(row["name"], (row["share"], row["next"]), offset, **style)
+            box = text.get_window_extent()
+            if box.x0 > axes.bbox.x0 and not any(map(box.overlaps, taken)) and not box.count_contains(points):
+                break
+            text.remove()
+        else:
+            text = axes.annotate(row["name"], (row["share"], row["next"]), (6, 3), **style)
+        taken.append(text.get_window_extent())
 
 
 def main() -> None:

@@ -64,21 +64,38 @@ def run_dask(
 
 
 def _run(distributed: Any, client: Any, materials: Sequence[Material], work: Work, watcher: Watcher) -> None:
-    memory = Memory()
+    """Run all side by side; then those whose workers died, one by one.
+
+    The scheduler blames a death on all that waits at the worker: alone, a material is to blame for its own.
+    """
     futures = {client.submit(attempt_at_worker, material, work, pure=False): material for material in materials}
-    queue = distributed.as_completed(futures)
+    queue, suspects = distributed.as_completed(futures), []
     for future in queue:
         material = futures.pop(future)
         try:
             outcome = future.result()
-        except distributed.KilledWorker as error:
-            outcome = give_up(material, f"its worker died: {' '.join(str(error).split())[:120]}", memory)
+        except distributed.KilledWorker:
+            suspects.append(material)
+            continue
         if outcome is None:  # another batch is at it
             again = client.submit(attempt_at_worker, material, work, SECONDS_BETWEEN_TRIES, pure=False)
             futures[again] = material
             queue.add(again)
         else:
             watcher.ended(outcome)
+    for material in suspects:
+        watcher.ended(_run_alone(distributed, client, material, work))
+
+
+def _run_alone(distributed: Any, client: Any, material: Material, work: Work) -> Outcome:
+    outcome, delay = None, 0.0
+    while outcome is None:
+        try:
+            outcome = client.submit(attempt_at_worker, material, work, delay, pure=False).result()
+        except distributed.KilledWorker as error:
+            outcome = give_up(material, f"its worker died: {' '.join(str(error).split())[:120]}", Memory())
+        delay = SECONDS_BETWEEN_TRIES
+    return outcome
 
 
 def attempt_at_worker(material: Material, work: Work, delay: float = 0.0) -> Outcome | None:
