@@ -1,6 +1,8 @@
 """One measurement, prepared, to one result file, and figures beside it."""
 
+import contextlib
 import dataclasses
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -12,22 +14,32 @@ from sbrdf_jax.progress import Progress
 from sbrdf_jax.records import RawSamples
 from sbrdf_jax.resampling.kept import Kept
 from sbrdf_jax.runtime import versions
+from sbrdf_jax.stopping import before_stopping
 from sbrdf_jax.store import RunResult, save
 
 
-def open_progress(output: Path, *, quiet: bool = False) -> Progress:
-    """Open the log `<output>.log`; its folder is made where it is missing.
+@contextlib.contextmanager
+def open_progress(output: Path, *, quiet: bool = False) -> Iterator[Progress]:
+    """Yield what writes the log `<output>.log`; a stop signal, however early, is its last line.
 
     Raises:
         UserError: The log cannot be written, and so neither can the result.
     """
     log = output.with_name(output.name + ".log")
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        return Progress(log, quiet=quiet)
-    except OSError as error:
-        found = f"found a log that cannot be written ({error.strerror})"
-        raise UserError(f"{log}: {found}; expected a folder to write to") from None
+
+    def say_so(word: str) -> None:
+        with log.open("a", encoding="utf-8") as file:  # whatever state `progress` is in
+            file.write(f"stopped: {word}\n")
+
+    with before_stopping(say_so):
+        try:
+            output.parent.mkdir(parents=True, exist_ok=True)
+            progress = Progress(log, quiet=quiet)
+        except OSError as error:
+            found = f"found a log that cannot be written ({error.strerror})"
+            raise UserError(f"{log}: {found}; expected a folder to write to") from None
+        with progress:
+            yield progress
 
 
 def run_to_file(

@@ -242,6 +242,23 @@ def test_midway_between_incident_angles_what_is_broad_stays_and_a_peak_moves_on(
     assert np.linalg.norm(error) < allowed * np.linalg.norm(expected[:, rows][:, :, at_nodes])
 
 
+def test_midway_knows_no_dead_incident_angle_and_guesses_nothing_where_they_are_uneven(amber):
+    brdf = np.array(amber[0].brdf)
+    brdf[3] = np.nan
+    dead = half_field(field_of(amber[0]), brdf, grid_of(brdf)).blocks[-1]
+    whole = half_field(field_of(amber[0]), amber[0].brdf, amber[0]).blocks[-1]
+    assert (dead.weight[[2, 3]] == 0).all() and (dead.weight[[0, 1, 4, 5]] > 0).all()
+    for row in (0, 1, 4):
+        assert np.linalg.norm(dead.brdf[row] - whole.brdf[row]) < 0.2 * np.linalg.norm(whole.brdf[row])
+
+    theta_i = np.radians([0.0, 15.0, 45.0, 60.0])
+    uneven = grid_of(truth("amber_glass", theta_i, THETA, PHI), theta_i=theta_i)
+    assert [block.theta_i.tolist() for block in half_field(field_of(uneven), uneven.brdf, uneven).blocks] == [
+        theta_i.tolist()
+    ] * 3
+    assert eta(represent(field_of(uneven), NUMBERS, uneven), uneven).max() < 0.02
+
+
 def test_near_the_mirror_direction_it_is_the_field_between_nodes_too(rng):
     samples = builtin.measure("amber_glass", count=400)
     samples = dataclasses.replace(samples, value=samples.value[:, ::20], wavelength_nm=samples.wavelength_nm[::20])

@@ -71,16 +71,12 @@ def compute_material(material: Material) -> None:
     from sbrdf_jax.resampling.kept import Kept
     from sbrdf_jax.runtime import set_up_jax
     from sbrdf_jax.single_run import open_progress, run_to_file
-    from sbrdf_jax.stopping import before_stopping
 
     set_up_jax()
     if not hasattr(_this_thread, "kept"):
         _this_thread.kept = Kept()
     options = material.options
-    with (
-        open_progress(material.result, quiet=True) as progress,
-        before_stopping(lambda word: progress.log(f"stopped: {word}")),
-    ):
+    with open_progress(material.result, quiet=True) as progress:
         try:
             raw = read(options.input.path, options.input)
             ready = prepare(raw, options, _this_thread.kept)

@@ -41,7 +41,6 @@ def run(args: argparse.Namespace) -> int:
     from sbrdf_jax.pipeline import failed_lanes, prepare
     from sbrdf_jax.plan import plan_text
     from sbrdf_jax.single_run import open_progress, run_to_file
-    from sbrdf_jax.stopping import before_stopping
     from sbrdf_jax.summary import summary_text
 
     ready = prepare(raw, options)
@@ -50,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     import_ahead("colour", *(["sbrdf_jax.report"] if options.output.report else []))
     output = Path(options.output.path)
-    with open_progress(output) as progress, before_stopping(lambda word: progress.log(f"stopped: {word}")):
+    with open_progress(output) as progress:
         progress.say(f"{raw.source}: {ready.cleaned.report.num_kept} of {raw.num_samples} samples kept")
         try:
             result = run_to_file(raw, ready, options, progress, time.perf_counter() - start)

@@ -99,9 +99,11 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
     if gridded is None or gridded.field is None:
         for at_o, at_phi in ((mid_o, mid_phi), (every_o, near)):
             add(nodes.theta_i, at_o, at_phi, _interpolate_logarithm(nodes, at_o, at_phi), GUESS_WEIGHT * share)
-        if field.interpolate_theta_i and len(nodes.theta_i) > 1:
+        gaps = np.diff(nodes.theta_i)
+        if field.interpolate_theta_i and len(gaps) and np.ptp(gaps) < SLACK:
             phi = np.sort(np.concatenate([nodes.phi_o, mid_phi]))
-            add(midpoints(nodes.theta_i), *_between_incident_angles(nodes, phi), MIDWAY_WEIGHT * less)
+            between = _between_incident_angles(nodes, share > 0, phi)
+            add(midpoints(nodes.theta_i), *between, MIDWAY_WEIGHT * less)
         return HalfField(tuple(blocks), known, asymmetry)
     finite = np.isin(np.asarray(gridded.field.wavelength_nm), np.asarray(field.basis.wavelength_nm))
     cell, beside = cells_between(needed), beside_mirror(needed)
@@ -190,7 +192,9 @@ def _interpolate_logarithm(nodes: Block, theta_o, phi_o):
     return np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))
 
 
-def _between_incident_angles(nodes: Block, phi_o) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _between_incident_angles(
+    nodes: Block, usable: Bool[np.ndarray, " i"], phi_o: Float[np.ndarray, " p"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return theta_o, phi_o and values midway between incident angles, by polynomials through up to six logarithms.
 
     On one path theta_o stays, as does what is broad; on the other it moves with theta_i, so that a peak that moves
@@ -205,33 +209,36 @@ def _between_incident_angles(nodes: Block, phi_o) -> tuple[np.ndarray, np.ndarra
     logarithm = _logarithm(nodes)
     if nodes.theta_i[0] < SLACK:  # beyond the normal is the other side, seen from behind
         logarithm = np.concatenate([logarithm[2:0:-1, :, ::-1], logarithm])
+        usable = np.concatenate([usable[2:0:-1], usable])
     along = PchipInterpolator(nodes.theta_o, logarithm, axis=1)
     above = np.arange(len(nodes.theta_i) - 1) + len(logarithm) - len(nodes.theta_i) + 1  # places of the next ones
-    stay, rough = _along_path(along, above, theta_o, 0.0, nodes.theta_o[-1])
-    move, uneven = _along_path(along, above, theta_o, step, GRAZING)
+    stay, rough = _along_path(along, usable, above, theta_o, 0.0, nodes.theta_o[-1])
+    move, uneven = _along_path(along, usable, above, theta_o, step, GRAZING)
     size = 1 + 2 * round(step / np.diff(nodes.theta_o).mean())
     rough, uneven = (maximum_filter1d(np.nan_to_num(error), size, axis=1) + SMOOTH for error in (rough, uneven))
     share = np.where(np.isfinite(move), 1 / (1 + (uneven / rough) ** 4), 0.0)
-    value = stay + share * (np.nan_to_num(move) - stay)
+    value = np.nan_to_num(stay + share * (np.nan_to_num(move) - stay))  # nan beside what is not usable, and weighs 0
     return theta_o, phi_o, np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))
 
 
-def _along_path(along, above, theta_o, step: float, last: float) -> tuple[np.ndarray, np.ndarray]:
+def _along_path(along, usable, above, theta_o, step: float, last: float) -> tuple[np.ndarray, np.ndarray]:
     """Return values midway between rows and how far they may be off: what the last of six rows adds; nan where none is.
 
     Args:
         along: Rows by theta_o.
+        usable: Which rows hold values.
         above: The row after each midway one.
         theta_o: Where the path is midway.
         step: By how much theta_o moves from row to row.
         last: Of theta_o on a path.
     """
-    num_rows, six = len(along(0.0)), []
+    six = []
     for number in range(-3, 3):
         at, row = theta_o + (number + 0.5) * step, above + number
-        value = along(np.clip(at, 0.0, last))[np.clip(row, 0, num_rows - 1)]
+        held = np.clip(row, 0, len(usable) - 1)
+        value = along(np.clip(at, 0.0, last))[held]
         value[:, (at < -SLACK) | (at > last + SLACK)] = np.nan
-        value[(row < 0) | (row >= num_rows)] = np.nan
+        value[(row != held) | ~usable[held]] = np.nan
         six.append(value)
     values = np.stack(six)
     exists, filled = np.isfinite(values), np.nan_to_num(values)

@@ -96,8 +96,8 @@ def represent(
         ends = half.nodes.theta_i[[0, -1]]
     else:
         ends = theta_i[[0, -1]]
-    num_rows = len(half.nodes.theta_i) if half.blocks else len(theta_i)
-    num_i = min(2 * num_rows - 1, MOST_FUNCTIONS) if field.interpolate_theta_i else len(theta_i)
+    num_rows = len(np.unique(np.concatenate([block.theta_i for block in half.blocks]))) if half.blocks else len(theta_i)
+    num_i = min(num_rows, MOST_FUNCTIONS) if field.interpolate_theta_i else len(theta_i)
     functions = num_i, min(len(theta_o), MOST_FUNCTIONS), num_direction_functions(floor)
     num_wavelengths = np.size(field.basis.wavelength_nm)
     layout = Layout(len(theta_i), functions, num_wavelengths, field.basis.kind == "data")
