@@ -46,6 +46,7 @@ def result(raw):
     metrics = {
         "relative_error": np.array([0.03, 0.05, 0.2, 0.4, 0.6]),
         "relative_error_between": np.array([0.04, 0.06, 0.2, np.inf, 0.6]),
+        "relative_error_near_mirror": np.array([0.05, 0.06, 0.2, 0.3, 0.6]),
         "error_spectral": np.array([0.01, 0.0, 0.01, 0.01, 0.01]),
         "error_lobe": np.array([0.02, 0.04, 0.1, 0.3, np.nan]),
         "relative_error_overall": np.array(0.33),

@@ -27,6 +27,7 @@ PAPER_ERROR = 0.045  # what the paper promises at L = 4, at normal incidence
 ERROR_CURVES = (
     ("relative_error", "total, at nodes (eq. 18)", INK, "-", "o"),
     ("relative_error_between", "total, between nodes", MUTED, LINES[1], "o"),
+    ("relative_error_near_mirror", "total, near mirror direction", PURPLE, LINES[2], "v"),
     ("error_spectral", "spectral truncation", BLUE, "-", "s"),
     ("error_background", "background", GREEN, LINES[3], "^"),
     ("error_lobe", "lobe", VERMILLION, LINES[2], "D"),
