@@ -269,8 +269,8 @@ def test_summary_names_every_incident_angle_however_bad(result):
         assert row in text
     rows = error_table(result).rows
     assert [row[0] for row in rows] == ["0", "22.5", "45", "67.5", "90 *", "all"]
-    assert rows[0][1:] == ("3", "4", "1", "2") and rows[3][2] == "inf" and rows[4][4] == "-"
-    assert rows[-1][1:] == ("33", "", "", "")
+    assert rows[0][1:] == ("3", "4", "5", "1", "2") and rows[3][2] == "inf" and rows[4][5] == "-"
+    assert rows[-1][1:] == ("33", "", "", "", "")
     assert time_table(result).rows[-1] == ("all", "12 s", "2.0 s", "10 s")
     lines = table_text(time_table(result)).splitlines()
     assert lines[0] == "Time" and len({len(line) for line in lines[1:]}) == 1
