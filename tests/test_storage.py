@@ -232,7 +232,7 @@ def test_fewer_bits_would_add_too_much(forms, method):
     fewest = is_small.index(True)
     name = VALUES[type(form)][0]
     same = [np.array_equal(getattr(found, name), getattr(trial, name)) for trial in trials]
-    assert same.index(True) - fewest in (0, 1)  # it starts to look a bit below what one trial foretells
+    assert same.index(True) - fewest in (0, 1)  # it starts to look two bits below what one trial foretells
 
 
 @pytest.mark.parametrize("unit", [1e-12, 1e12])

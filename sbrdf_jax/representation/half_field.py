@@ -18,8 +18,9 @@ UNKNOWN_WEIGHT = 0.01  # of an incident angle without data: it does not count, b
 BETWEEN_WEIGHT = 0.03  # of the error between the nodes, beside that at them, where the field is known there
 MIRROR_WEIGHT = 0.02  # of the error near the mirror direction, closer to it than any node or midpoint but its own
 NEAR_MIRROR = np.array([2 / 3, 1 / 3, 1 / 6, 1 / 12, 1 / 24, 0.0])  # steps of phi_o off the plane of incidence
-GUESS_WEIGHT = 1e-3  # where it is interpolated: enough that nothing runs wild
-MIDWAY_WEIGHT = 0.1  # where it is interpolated midway between incident angles: a better guess than splines
+GUESS_WEIGHT = 1e-4  # where it is interpolated: enough that nothing runs wild
+MIDWAY_WEIGHT = 0.1  # where it is interpolated between incident angles so far apart that splines alone are a poor guess
+WIDE_GAP = np.radians(15.0)  # so far; below it splines are better by the fourth power of the gap, and this counts less
 RELATIVE_SHARE = 0.03  # of the error relative to each direction's own energy
 RELATIVE_FLOOR = 1e-3  # of the mean energy of a direction
 SLACK = 1e-9  # rad
@@ -103,7 +104,8 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
         if field.interpolate_theta_i and len(gaps) and np.ptp(gaps) < SLACK:
             phi = np.sort(np.concatenate([nodes.phi_o, mid_phi]))
             between = _between_incident_angles(nodes, share > 0, phi)
-            add(midpoints(nodes.theta_i), *between, MIDWAY_WEIGHT * less)
+            trust = min(float(gaps[0] / WIDE_GAP), 1.0) ** 8
+            add(midpoints(nodes.theta_i), *between, MIDWAY_WEIGHT * trust * less)
         return HalfField(tuple(blocks), known, asymmetry)
     finite = np.isin(np.asarray(gridded.field.wavelength_nm), np.asarray(field.basis.wavelength_nm))
     cell, beside = cells_between(needed), beside_mirror(needed)

@@ -107,13 +107,13 @@ def _trials(compact: Form, storage: str, measure, allowed, known) -> Iterator[Fo
     """Yield the form in ever wider storage, unrounded at last.
 
     Numerics:
-        A bit halves what rounding adds, but for its chance: "quantised" starts a bit below what one trial foretells.
+        A bit halves what rounding adds, but for its chance: "quantised" starts two bits below what one trial foretells.
     """
     names = (*VALUES[type(compact)], *PRECISE[type(compact)])
     is_finite = all(np.isfinite(np.asarray(getattr(compact, name))).all() for name in names)
     if storage == "quantised" and is_finite and (allowed > 0).all():
         excess = measure(round_form(compact, storage, FIRST_BITS)).storage_error[known] / allowed
-        start = FIRST_BITS + np.ceil(np.log2(np.max(excess, initial=2.0**-FIRST_BITS))) - 1
+        start = FIRST_BITS + np.ceil(np.log2(np.max(excess, initial=2.0**-FIRST_BITS))) - 2
         for bits in range(int(np.clip(start, 1, MOST_BITS)), MOST_BITS + 1):
             yield round_form(compact, storage, bits)
     elif storage != "quantised":
