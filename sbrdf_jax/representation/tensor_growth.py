@@ -79,7 +79,7 @@ def grow(
         settled = found  # settled for all, not for the worst
     cells = np.size(settled.core)
     most = min(cells, budget - numbers(*settled.ranks, channels, num_words(cells)))
-    return prune(fit, settled, max(int(most), 1), is_enough)
+    return prune(fit, settled, max(int(most), 1), is_enough if enough else None)
 
 
 class _Step(NamedTuple):

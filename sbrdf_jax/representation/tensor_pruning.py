@@ -27,20 +27,20 @@ def num_words(cells: int) -> int:
     return -(-cells // WORD)
 
 
-def prune(fit: TensorFit, factors: Factors, most: int, is_enough: Callable[[Factors], bool]) -> Factors:
+def prune(fit: TensorFit, factors: Factors, most: int, is_enough: Callable[[Factors], bool] | None) -> Factors:
     """Take cells off the core.
 
     Args:
         fit: The problem.
         factors: What is to be pruned; its core is the best one for its factors.
         most: Most cells that may be left.
-        is_enough: Asked after each round below `most`; the last that is enough is returned.
+        is_enough: Asked after each round below `most`; the last that is enough is returned. None: there is none below.
     """
     thinning = _Thinning(fit, _turned(factors))
     while thinning.count > most:
         thinning.thin(max(int(ROUND * thinning.count), most))
     found = thinning.factors()
-    while thinning.count > 1:
+    while is_enough is not None and thinning.count > 1:
         thinning.thin(int(ROUND * thinning.count))
         fewer = thinning.factors()
         if not is_enough(fewer):

@@ -58,6 +58,11 @@ class Centres:
         """Centres of each group, padding included."""
         return self.count // self.num_groups
 
+    @property
+    def group(self) -> np.ndarray:
+        """Group of each centre [centre], by number; -1 without a sample."""
+        return np.where(self.number > 0, np.arange(self.count) // self.num_members, -1)
+
     def prior(self, variance: ModeVariance) -> np.ndarray:
         """Prior covariance [centre, centre], computed once for each smoothness."""
         if id(variance) not in self._prior:

@@ -114,8 +114,7 @@ def estimate(
     # a centre's own extra noise, or what averaging took from it, is not that of a new measurement
     spread = np.maximum(variance - noise, 0.0) + choice.noise
     scale = _calibrate(centres, samples, model + residual - out, spread, floor)
-    group = np.where(seen, np.arange(centres.count) // centres.num_members, -1)
-    out, variance = leave_group_out(lower, dual, group)
+    out, variance = leave_group_out(lower, dual, centres.group)
     unsure = np.maximum(variance - noise, 0.0)
     scale = _calibrate_between(scale, centres, samples, model + residual - out, unsure, choice.noise, floor)
     return Estimates(
@@ -178,7 +177,7 @@ def _calibrate_between(
     theta_i, half = centres.angles[0, centre], centres.at.half[centre]
     squares = (error / residual_scale(scale, theta_i, half, z)) ** 2 - noise
     ratio = np.maximum(squares, 0.0) / np.maximum(unsure[centre], TINY)[:, None]
-    group = centre // centres.num_members
+    group = centres.group[centre]
     members = [group == number for number in np.unique(group)]
     members.sort(key=lambda rows: np.median(theta_i[rows]))
     angles = np.array([np.median(theta_i[rows]) for rows in members])

@@ -59,8 +59,7 @@ def left_out_error(
     out, dual = leave_one_out(lower, residual)
     error = mean_root(out[seen])
     if centres.num_groups > 1:
-        group = np.where(seen, np.arange(centres.count) // centres.num_members, -1)
-        error = float(np.sqrt(error * mean_root(leave_group_out(lower, dual, group)[0][seen])))
+        error = float(np.sqrt(error * mean_root(leave_group_out(lower, dual, centres.group)[0][seen])))
     return error if np.isfinite(error) else np.inf, out
 
 
