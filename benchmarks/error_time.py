@@ -8,6 +8,7 @@ results/error_time/benchmark_resampling.png.
 """
 
 import argparse
+import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -34,7 +35,7 @@ class Point(NamedTuple):
     timing: Timing
     answer: np.ndarray  # [unknown, lane]
     set_up_seconds: float = 0.0
-    precision: str = "float64"
+    precision: str = "float64"  # or float32; mixed: float32 first, float64 to the end
 
 
 def own_points(operator, rhs, known, set_up_seconds: float, repeats: int) -> Iterator[Point]:
@@ -52,6 +53,9 @@ def own_points(operator, rhs, known, set_up_seconds: float, repeats: int) -> Ite
         method = ProjectedNewton(tolerance=tolerance)
         found, timing = timed(lambda method=method: solve_in_rounds(operator, rhs, method), repeats)
         yield Point("own, without set-up", f"{tolerance:.0e}", timing, np.asarray(found.value))
+        mixed = dataclasses.replace(method, precision="float32")
+        found, timing = timed(lambda method=mixed: solve_in_rounds(operator, rhs, method), repeats)
+        yield Point("own, without set-up", f"{tolerance:.0e}", timing, np.asarray(found.value), precision="mixed")
         if tolerance >= FLOAT32_TOLERANCE:
             found, timing = timed(lambda method=method: solve_in_rounds(single, rhs_single, method), repeats)
             answer = np.asarray(found.value, np.float64)

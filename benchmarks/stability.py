@@ -61,8 +61,8 @@ def solver_rows() -> Iterator[Row]:
 
     from sbrdf_jax.nnls import DenseNormal, ProjectedNewton, solve_in_rounds
 
-    method = ProjectedNewton(tolerance=SOLVER_TOLERANCE)
-    for condition in CONDITIONS:
+    for precision, condition in itertools.product(("float64", "float32"), CONDITIONS):
+        method = ProjectedNewton(tolerance=SOLVER_TOLERANCE, precision=precision)
         problem = singular_problem(condition)
         matrix, rhs = problem.matrix.T @ problem.matrix, problem.matrix.T @ problem.target
         start = time.perf_counter()
@@ -71,7 +71,7 @@ def solver_rows() -> Iterator[Row]:
         error = np.linalg.norm(found.value - problem.solution) / np.linalg.norm(problem.solution)
         yield {
             "problem": "planted solution",
-            "method": "solver alone",
+            "method": "solver alone" if precision == "float64" else "solver alone, float32 first",
             "condition": float(np.linalg.cond(matrix)),
             "error": float(error),
             "seconds": seconds,

@@ -22,10 +22,6 @@ NOT_YET: dict[str, tuple[Callable[[Any], bool], str]] = {
         lambda value: value in ("rgl-bsdf", "merl", "astm", "pab", "inplane", "alta"),
         "auto, pbrt, csv, hdf5, nist",
     ),
-    "runtime.precision": (
-        lambda value: value == "float32",
-        "float64 (measured in float32: no lane converges, and guided ends up to a third of the largest value off)",
-    ),
 }
 
 # What auto means, by method; what is not here stays auto and is decided by the data.

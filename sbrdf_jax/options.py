@@ -234,7 +234,7 @@ class RuntimeOptions:
     __pydantic_config__ = _STRICT
 
     precision: Literal["float64", "float32"] = "float64"
-    """float32: iterates in float32, certificates and refinement in float64."""
+    """float32: solvers begin in it; refinement, certificates and what is solved directly stay in float64."""
     resume_from: Text | None = None
     """A result whose parts may be reused, relative to the working directory."""
 

@@ -112,7 +112,8 @@ def process(
     with _timed(progress, timing, "resample"):
         gridded = None if known is None else part_of(known, ready.grid, needs, samples.wavelength_nm)
         if gridded is None:
-            gridded = resample(samples, ready.grid, options.resample, progress.update, kept, needs, known)
+            say, precision = progress.update, options.runtime.precision
+            gridded = resample(samples, ready.grid, options.resample, say, kept, needs, known, precision)
         else:
             progress.update(f"taken from {options.runtime.resume_from}")
         if gridded.field is None and not needs.node.all():

@@ -94,7 +94,6 @@ WRONG_KEYS_AND_VALUES = [
 
 NOT_BUILT = {
     "input.format": ["rgl-bsdf", "merl", "astm", "pab", "inplane", "alta"],
-    "runtime.precision": ["float32"],
 }
 
 WRONG_OVERRIDES = [

@@ -225,12 +225,13 @@ def test_leave_group_out_equals_refits(rng):
 
 
 @pytest.mark.parametrize("raised", [0.0, 10.0])  # by 10 the unbounded answer keeps the bound, and nothing is solved
-def test_bounded_answer_equals_scipys(rng, raised):
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_bounded_answer_equals_scipys(rng, raised, precision):
     """Against min |N^-1/2 (z - data)|^2 + (z - model)' K^-1 (z - model), z >= 0, stated in z itself."""
     prior, noise, residual = (np.asarray(a) for a in random_problem(rng))
     prior, noise, model = prior + 0.1 * np.eye(40), 10 * noise, rng.uniform(0, 0.3, residual.shape) + raised
     inverse = mirror_lower(lower_inverse(prior, noise))
-    found = solve_bounded(prior, inverse, noise, residual, model, ProjectedNewton(tolerance=1e-10))
+    found = solve_bounded(prior, inverse, noise, residual, model, ProjectedNewton(1e-10, precision=precision))
     z = model + prior @ found.dual
     assert (z > -1e-9).all() and (z < 1e-9).any() == (raised == 0) == found.multiplier.any()
     assert found.kkt_residual.max() <= 1e-10 and (found.status == Status.OK).all()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from problems import LeastSquaresProblem, least_squares_problems
-from tolerances import GRADIENT, LANE, OBJECTIVE, PLANTED, ROUNDING, tolerance
+from tolerances import GRADIENT, KKT, LANE, OBJECTIVE, PLANTED, ROUNDING, tolerance
 
 from sbrdf_jax import nnls
 from sbrdf_jax.nnls import (
@@ -21,10 +21,12 @@ from sbrdf_jax.records import Status
 solve_nnls = jax.jit(nnls.solve_nnls, static_argnames="method")
 
 TOLERANCE = 1e-11
-METHODS = [
-    ProjectedNewton(tolerance=TOLERANCE, max_steps=50_000),
-    JaxoptProjectedGradient(tolerance=1e-14, max_steps=20_000),
-]
+METHODS = {
+    "projected Newton": ProjectedNewton(tolerance=TOLERANCE, max_steps=50_000),
+    "projected Newton, float32 first": ProjectedNewton(tolerance=TOLERANCE, max_steps=50_000, precision="float32"),
+    "jaxopt": JaxoptProjectedGradient(tolerance=1e-14, max_steps=20_000),
+}
+PRECISIONS = pytest.mark.parametrize("precision", ["float64", "float32"])
 PROBLEMS = least_squares_problems()
 
 
@@ -45,7 +47,7 @@ def plain_kkt_residual(problem: LeastSquaresProblem, x: np.ndarray) -> np.ndarra
     return np.abs(projected / scale).max(axis=0) / np.where(size > 0, size, 1.0)
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 @pytest.mark.parametrize("problem", PROBLEMS, ids=lambda p: p.name)
 def test_proves_its_answer_and_equals_scipy(problem, method):
     found = solve_nnls(*normal(problem), method)
@@ -94,10 +96,13 @@ def test_a_bad_lane_spoils_no_other():
     np.testing.assert_allclose(found.value[:, [0, 3]], good.value[:, [0, 3]], rtol=0, atol=tolerance(LANE, float))
 
 
-@pytest.mark.parametrize("factor", [1e-12, 1e-6, 1e6, 1e12])
-def test_scaling_the_data_scales_the_answer(factor):
+@PRECISIONS
+@pytest.mark.parametrize("factor", [1e-60, 1e-12, 1e-6, 1e6, 1e12, 1e60])
+def test_scaling_the_data_scales_the_answer(factor, precision):
     operator, rhs = normal(PROBLEMS[0])
-    plain, scaled = solve_nnls(operator, rhs), solve_nnls(operator, rhs * factor)
+    method = ProjectedNewton(precision=precision)
+    plain, scaled = solve_nnls(operator, rhs, method), solve_nnls(operator, rhs * factor, method)
+    assert (np.asarray(plain.status) == Status.OK).all()
     np.testing.assert_allclose(scaled.value / factor, plain.value, rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(scaled.status, plain.status)
 
@@ -109,9 +114,10 @@ def test_step_limit_is_a_status_not_a_success():
     assert (np.asarray(found.residual) > 1e-12).all()
 
 
-def test_rounds_are_the_same_solver_and_report():
+@PRECISIONS
+def test_rounds_are_the_same_solver_and_report(precision):
     operator, rhs = normal(PROBLEMS[2])
-    method, seen = ProjectedNewton(tolerance=1e-10), []
+    method, seen = ProjectedNewton(tolerance=1e-10, precision=precision), []
     rounds = solve_in_rounds(operator, rhs, method, lambda done, total: seen.append((done, total)))
     plain = solve_nnls(operator, rhs, method)
     np.testing.assert_allclose(rounds.value, plain.value, rtol=0, atol=tolerance(ROUNDING, float))
@@ -119,21 +125,37 @@ def test_rounds_are_the_same_solver_and_report():
     assert seen[-1] == (3, 3) and all(total == 3 for _, total in seen)
 
 
-def test_rounds_stop_at_a_bad_lane_and_at_the_limit():
+def test_most_steps_are_in_float32_where_they_may_be():
     operator, rhs = normal(PROBLEMS[2])
-    bad = solve_in_rounds(operator, rhs.at[0, 0].set(jnp.nan), ProjectedNewton(tolerance=1e-8))
+    start = jnp.zeros_like(rhs)
+    single, target, begun = nnls._in_float32(operator, rhs, start)
+    assert single.matrix.dtype == target.dtype == begun.dtype == np.float32
+    whole = solve_nnls(operator, rhs, ProjectedNewton())
+    mixed = solve_nnls(operator, rhs, ProjectedNewton(precision="float32"))
+    rest = solve_nnls(operator, rhs, ProjectedNewton(), mixed.value)
+    assert mixed.value.dtype == np.float64 and not np.asarray(rest.num_steps).any()
+    first = nnls.solve_nnls(single, target, ProjectedNewton(tolerance=nnls.FLOAT32_TOLERANCE), begun)
+    assert (np.asarray(first.num_steps) > 0.3 * np.asarray(mixed.num_steps)).all()
+    np.testing.assert_allclose(mixed.value, whole.value, rtol=0, atol=tolerance(KKT, float) * np.abs(whole.value).max())
+
+
+@PRECISIONS
+def test_rounds_stop_at_a_bad_lane_and_at_the_limit(precision):
+    operator, rhs = normal(PROBLEMS[2])
+    bad = solve_in_rounds(operator, rhs.at[0, 0].set(jnp.nan), ProjectedNewton(precision=precision))
     assert list(np.asarray(bad.status)) == [Status.NONFINITE, Status.OK, Status.OK]
     stopped = solve_in_rounds(operator, rhs, ProjectedNewton(tolerance=1e-15, max_steps=5))
     assert (np.asarray(stopped.num_steps) == 5).all() and (np.asarray(stopped.status) == Status.MAX_STEPS).all()
 
 
-def test_derivatives_are_those_of_the_solution():
+@PRECISIONS
+def test_derivatives_are_those_of_the_solution(precision):
     matrix, target = jnp.asarray(PROBLEMS[0].matrix), jnp.asarray(PROBLEMS[0].target[:, :2])
     direction = jnp.asarray(np.random.default_rng(1).standard_normal(matrix.shape))
 
     def loss(t, b):
         moved = matrix + t * direction
-        found = solve_nnls(DenseNormal(moved.T @ moved), moved.T @ b, ProjectedNewton(tolerance=1e-13))
+        found = solve_nnls(DenseNormal(moved.T @ moved), moved.T @ b, ProjectedNewton(1e-13, precision=precision))
         return jnp.sum(jnp.sin(found.value))
 
     by_matrix, by_data = jax.grad(loss, argnums=(0, 1))(jnp.asarray(0.0), target)

@@ -9,6 +9,7 @@ from problems import scattered_samples
 from test_grid import grid_of
 from tolerances import KKT, OBJECTIVE, ROUNDING, tolerance
 
+from sbrdf_jax import multipliers
 from sbrdf_jax.angles import fold_azimuth
 from sbrdf_jax.formats import read
 from sbrdf_jax.grid import Grid, make_grid, second_difference_rows
@@ -76,6 +77,17 @@ def test_field_is_scipys_non_negative_least_squares(rng):
         objective = np.sum((matrix @ x - target[:, lane]) ** 2)
         assert objective - norm**2 <= tolerance(OBJECTIVE, float) * norm**2
     assert (np.asarray(found.brdf) >= 0).all()
+
+
+@pytest.mark.parametrize("most_unknowns", [0, 6000], ids=["steps from 0", "from the multipliers"])
+def test_float32_first_ends_at_the_same_certificate(rng, monkeypatch, most_unknowns):
+    monkeypatch.setattr(multipliers, "MAX_UNKNOWNS", most_unknowns)
+    samples = scattered_samples(rng, [0.0, 30.0, 60.0], 40, 2)
+    grid = make_grid(samples, GridOptions(30.0, 22.5, 45.0), bilateral=True)
+    whole, mixed = resample(samples, grid, PAPER), resample(samples, grid, PAPER, precision="float32")
+    assert (np.asarray(mixed.kkt_residual) <= tolerance(KKT, float)).all() and (np.asarray(mixed.brdf) >= 0).all()
+    np.testing.assert_allclose(mixed.brdf, whole.brdf, rtol=0, atol=1e-5 * np.max(whole.brdf))
+    assert np.asarray(mixed.brdf).dtype == np.float64
 
 
 def test_a_dead_wavelength_fails_alone(rng):

@@ -96,6 +96,16 @@ def test_same_input_gives_the_same_datasets(folder, result_path):
         first.visititems(compare)
 
 
+def test_float32_first_gives_the_same_result(folder, result_path):
+    assert main(command(folder, "runtime.precision=float32", output="mixed.h5")) == 0
+    with h5py.File(result_path) as whole, h5py.File(folder / "mixed.h5") as mixed:
+        for name in ("grid/brdf", "validation/predicted"):
+            one, other = whole[name][()], mixed[name][()]
+            assert one.dtype == other.dtype == np.float64
+            np.testing.assert_allclose(other, one, rtol=0, atol=1e-6 * np.abs(one).max())
+        assert (mixed["grid/kkt_residual"][()] <= 1e-8).all() and (mixed["grid/status"][()] == 0).all()
+
+
 def test_a_second_measurement_of_equal_geometry_compiles_nothing(folder, result_path):
     events = []
     jax.monitoring.register_event_duration_secs_listener(lambda event, _seconds, **_kw: events.append(event))
@@ -185,7 +195,7 @@ WRONG_COMMANDS = {
     "output is a folder": (["{config}", "output.path={folder}"], "folder"),
     "output below a file": (["{config}", "output.path={config}/x.h5"], "file"),
     "unknown builtin": (["{config}", "input.path=builtin:green_glass"], "green_glass"),
-    "not built yet": (["{config}", "runtime.precision=float32"], "not available yet"),
+    "not built yet": (["{config}", "input.format=merl"], "not available yet"),
     "no earlier result": (["{config}", "runtime.resume_from=old.h5"], "runtime.resume_from: old.h5: no such file"),
     "missing fold file": (["{config}", "validate.fold_file=absent.csv"], "absent.csv"),
     "more folds than directions": (["{config}", "validate.folds=1000"], "validate.folds: found 1000"),

@@ -6,6 +6,7 @@ import numpy as np
 
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.needs import Needs
+from sbrdf_jax.nnls import Precision
 from sbrdf_jax.options import ResampleOptions
 from sbrdf_jax.records import GriddedBRDF, RawSamples
 from sbrdf_jax.resampling.guided import resample_guided
@@ -22,6 +23,7 @@ def resample(
     kept: Kept | None = None,
     needs: Needs | None = None,
     known: GriddedBRDF | None = None,
+    precision: Precision = "float64",
 ) -> GriddedBRDF:
     """Resample a measurement by the method that the options name.
 
@@ -33,6 +35,7 @@ def resample(
         kept: What the run before it may have worked out, and the next one may use.
         needs: What is needed of it; None: everything. Method "paper" couples all nodes and skips wavelengths alone.
         known: An earlier answer for the same samples, grid and options, of which what is needed is taken over.
+        precision: In which the bounded solvers begin; the certificate, and what is solved directly, is float64.
 
     Returns:
         The field on the grid, at the wavelengths and incident angles that are needed.
@@ -46,9 +49,11 @@ def resample(
     if options.method == "paper":
         say = None if report is None else (lambda done, total: report(f"{done} of {total} wavelengths converged"))
         wanted = np.ones(len(samples.wavelength_nm), bool) if needs is None else needs.wavelength
-        return resample_paper(samples, grid, options, say, kept.inverse, wanted=wanted, known=known)
+        parts = {"wanted": wanted, "known": known, "precision": precision}
+        return resample_paper(samples, grid, options, say, kept.inverse, **parts)
     if options.method == "guided":
         centres = kept.centres(samples, grid.reciprocal)
         estimates = kept.estimates(samples, options, centres, report, None if known is None else known.field)
-        return resample_guided(samples, grid, options, report, centres, estimates=estimates, needs=needs, known=known)
+        parts = {"estimates": estimates, "needs": needs, "known": known, "precision": precision}
+        return resample_guided(samples, grid, options, report, centres, **parts)
     raise ValueError(f"resample method {options.method!r} is not available; it is paper or guided")

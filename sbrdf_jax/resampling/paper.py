@@ -1,6 +1,7 @@
 """Resampling as the paper has it: eqs. (4) to (10), every wavelength at once."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ from jaxtyping import Array, Float
 
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.multipliers import InverseNormal, invert_normal, start_from_multipliers
-from sbrdf_jax.nnls import NNLSResult, ProjectedNewton, scale_of, solve_in_rounds
+from sbrdf_jax.nnls import NNLSResult, Precision, ProjectedNewton, scale_of, solve_in_rounds
 from sbrdf_jax.options import ResampleOptions
 from sbrdf_jax.records import GriddedBRDF, RawSamples
 from sbrdf_jax.resampling.extrapolation import extrapolated_nodes
@@ -25,6 +26,7 @@ def resample_paper(
     *,
     wanted: np.ndarray | None = None,
     known: GriddedBRDF | None = None,
+    precision: Precision = "float64",
 ) -> GriddedBRDF:
     """Fit the non-negative grid whose sinc interpolation is nearest to the samples.
 
@@ -40,6 +42,7 @@ def resample_paper(
             weight, so one serves every material of a geometry.
         wanted: Mask of the wavelengths that are needed; None: all.
         known: An earlier answer for the same samples, grid and options, whose wavelengths are taken over.
+        precision: Of the solver's first steps, as for `solve_normal`.
 
     Returns:
         The grid with its certificate; nowhere negative, one value at each pole.
@@ -48,9 +51,10 @@ def resample_paper(
         part = {"wavelength_nm": samples.wavelength_nm[wanted], "value": samples.value[:, wanted]}
         samples = dataclasses.replace(samples, **part)
     if known is not None and np.isin(samples.wavelength_nm, known.wavelength_nm).any():
-        return _with_known(known, samples, lambda fresh: resample_paper(fresh, grid, options, report, invert))
+        solve = functools.partial(resample_paper, report=report, invert=invert, precision=precision)
+        return _with_known(known, samples, lambda fresh: solve(fresh, grid, options))
     operator, rhs = normal_equations(samples, grid, float(options.smoothness_weight))
-    found = solve_normal(operator, rhs, float(options.tolerance), invert(operator), report)
+    found = solve_normal(operator, rhs, float(options.tolerance), invert(operator), report, precision)
     return GriddedBRDF(
         theta_i=jnp.asarray(grid.theta_i),
         theta_o=jnp.asarray(grid.theta_o),
@@ -91,6 +95,7 @@ def solve_normal(
     tolerance: float,
     known: InverseNormal | None,
     report: Callable[[int, int], None] | None = None,
+    precision: Precision = "float64",
 ) -> NNLSResult:
     """Minimise over the non-negative grids: from the multipliers where A'A has an inverse, then to the certificate.
 
@@ -100,6 +105,7 @@ def solve_normal(
         tolerance: Relative KKT residual to reach.
         known: Inverse of A'A; None where there is none, then the solver starts at 0.
         report: Called with (wavelengths converged, wavelengths) as the solver goes.
+        precision: Of the first steps where there is no inverse; the multipliers' first rounds are float32 in any case.
 
     Returns:
         The answer; `num_steps` counts the steps of both parts.
@@ -108,7 +114,7 @@ def solve_normal(
         ValueError: `known` is of another geometry.
     """
     if known is None:
-        return solve_in_rounds(operator, rhs, ProjectedNewton(tolerance=tolerance), report)
+        return solve_in_rounds(operator, rhs, ProjectedNewton(tolerance=tolerance, precision=precision), report)
     if not np.array_equal(np.asarray(known.scale), np.asarray(scale_of(operator))):
         raise ValueError("the inverse is not of this normal matrix: angles, grid or smoothness weight differ")
     start, num_steps = start_from_multipliers(operator, rhs, known, tolerance)

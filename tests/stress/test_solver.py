@@ -11,6 +11,7 @@ from sbrdf_jax.records import Status
 
 EPSILON = np.finfo(float).eps
 METHOD = ProjectedNewton(tolerance=1e-8)
+MIXED = ProjectedNewton(tolerance=1e-8, precision="float32")
 CONDITIONS = (1e2, 1e5, 1e8, 1e11, 1e14)
 
 
@@ -27,10 +28,11 @@ def plain_residual(matrix, rhs, x) -> np.ndarray:
 
 @pytest.mark.parametrize("condition", CONDITIONS)
 @pytest.mark.parametrize("size", [1e-12, 1.0, 1e12])
-def test_the_certificate_is_true_and_bounds_the_error(condition, size):
+@pytest.mark.parametrize("method", [METHOD, MIXED], ids=["float64", "mixed"])
+def test_the_certificate_is_true_and_bounds_the_error(condition, size, method):
     problem = singular_problem(condition)
     matrix, rhs = problem.matrix.T @ problem.matrix, problem.matrix.T @ problem.target * size
-    found = solve(DenseNormal(jnp.asarray(matrix)), jnp.asarray(rhs), METHOD)
+    found = solve(DenseNormal(jnp.asarray(matrix)), jnp.asarray(rhs), method)
     x, residual = np.asarray(found.value), np.asarray(found.residual)
     assert np.isfinite(x).all() and (x >= 0).all()
     np.testing.assert_array_equal(found.status, np.where(residual <= 1e-8, Status.OK, Status.MAX_STEPS))

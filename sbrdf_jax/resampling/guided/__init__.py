@@ -11,6 +11,7 @@ import numpy as np
 
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.needs import Needs, everything
+from sbrdf_jax.nnls import Precision
 from sbrdf_jax.options import ResampleOptions
 from sbrdf_jax.records import GriddedBRDF, RawSamples, Status
 from sbrdf_jax.resampling.extrapolation import extrapolated_nodes
@@ -59,6 +60,7 @@ def fit_field(
     needed: np.ndarray | None = None,
     estimates: Estimates | None = None,
     known: GuidedFit | None = None,
+    precision: Precision = "float64",
 ) -> GuidedFit:
     """Fit the guided field to cleaned samples, whatever their wavelengths hold.
 
@@ -71,6 +73,7 @@ def fit_field(
         needed: Mask of the wavelengths that are wanted, which change nothing of each other; None: all.
         estimates: Of the whole measurement, where they have been made.
         known: A fit to the same samples, whose wavelengths need not be solved again.
+        precision: Of the bounded solver's first steps.
     """
     centres = centres or place_centres(samples)
     estimates = estimates or estimate_whole(samples, options, centres, report)
@@ -81,7 +84,7 @@ def fit_field(
     fresh = np.isin(estimates.wavelength_nm, wanted) & ~np.isin(estimates.wavelength_nm, held)
     if report is not None:
         report(f"bounded least squares, {fresh.sum()} wavelengths")
-    fit = solve_field(estimates, centres, fresh, float(options.tolerance))
+    fit = solve_field(estimates, centres, fresh, float(options.tolerance), precision)
     if known is not None and len(held):
         fit = join_fits(take_fit(known, np.isin(known.field.wavelength_nm, held)), fit)
     wavelength_nm, finite, live = samples.wavelength_nm[needed], finite[needed], live[needed]
@@ -110,6 +113,7 @@ def resample_guided(
     estimates: Estimates | None = None,
     needs: Needs | None = None,
     known: GriddedBRDF | None = None,
+    precision: Precision = "float64",
 ) -> GriddedBRDF:
     """Fit the guided field, and read it and its standard error off at the grid's nodes.
 
@@ -123,12 +127,14 @@ def resample_guided(
         needs: Which wavelengths and nodes; None: all. Skipped incident angles and wavelengths have no place in
             the answer, other skipped nodes are nan.
         known: An earlier answer for the same samples and options, of which what is needed is taken over.
+        precision: As for `fit_field`.
     """
     needs = needs or everything(grid, len(samples.wavelength_nm))
     centres = centres or place_centres(samples, grid.reciprocal)
     estimates = estimates or estimate_whole(samples, options, centres, report)
     earlier = None if known is None else fit_of(known, estimates.whiten)
-    fit = fit_field(samples, options, report, centres, needed=needs.wavelength, estimates=estimates, known=earlier)
+    parts = {"needed": needs.wavelength, "estimates": estimates, "known": earlier, "precision": precision}
+    fit = fit_field(samples, options, report, centres, **parts)
     if report is not None:
         report("nodes")
     held = estimates.node_variance, centres.node_covariance

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sbrdf_jax.host_blas import one_blas_thread
-from sbrdf_jax.nnls import ProjectedNewton
+from sbrdf_jax.nnls import Precision, ProjectedNewton
 from sbrdf_jax.resampling.guided.bounds import solve_bounded
 from sbrdf_jax.resampling.guided.centres import Centres
 from sbrdf_jax.resampling.guided.covariance import node_values
@@ -25,7 +25,9 @@ class GuidedFit(NamedTuple):
     whiten: np.ndarray  # [centre, centre] inverse Cholesky factor of prior plus noise, for standard errors
 
 
-def solve_field(estimates: Estimates, centres: Centres, needed: np.ndarray, tolerance: float) -> GuidedFit:
+def solve_field(
+    estimates: Estimates, centres: Centres, needed: np.ndarray, tolerance: float, precision: Precision = "float64"
+) -> GuidedFit:
     """Solve the bounded problem at some wavelengths, which do not depend on each other.
 
     Args:
@@ -33,10 +35,11 @@ def solve_field(estimates: Estimates, centres: Centres, needed: np.ndarray, tole
         centres: Where the samples are.
         needed: Which of the estimates' wavelengths: a mask.
         tolerance: Relative KKT residual to reach.
+        precision: Of the bounded solver's first steps.
     """
     prior = centres.prior(estimates.variance)
     parts = (estimates.inverse, estimates.noise, estimates.residual[:, needed], estimates.model[:, needed])
-    bounded = solve_bounded(prior, *parts, ProjectedNewton(tolerance=tolerance))
+    bounded = solve_bounded(prior, *parts, ProjectedNewton(tolerance=tolerance, precision=precision))
     with one_blas_thread():
         nodes = node_values(estimates.variance, centres.features, bounded.dual)
     amplitude = estimates.lobe.log_amplitude
