@@ -3,6 +3,9 @@
 import contextlib
 import functools
 import json
+import mmap
+import os
+import struct
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,8 @@ LARGEST_COMPACT = 2**15  # bytes; datasets up to it lie in their own header, who
 LONGEST_PLAIN = 64  # bytes; what is shorter gains nothing by compression
 FORMAT = ("v110", "v110")  # of HDF5: the oldest whose every header has a checksum, so that damage is told, not followed
 LONGEST_REASON = 200  # characters of an error that quotes a file
+TEXTS = b"GCOL\x01\0\0\0"  # begins a heap of texts: magic, version, 3 bytes of nothing; then its size, and objects
+OBJECT = struct.Struct("<HHIQ")  # index, references, nothing, size; then its bytes, filled up to a multiple of 8
 MOST_EXPANSION = 1000  # a dataset may declare at most this many times what it holds, or the file is refused
 
 
@@ -186,6 +191,32 @@ def read_mapping(group: h5py.Group, without: Collection[str] = ()) -> dict[str, 
             value = read(group, name)
             found[name] = value if value.ndim else value[()].item()
     return found
+
+
+def check_texts(path: str | os.PathLike) -> None:
+    """Look whether the heaps of texts of an HDF5 file are whole: no checksum covers them, and the library may loop.
+
+    Raises:
+        ValueError: One is damaged: its objects do not end where it ends.
+    """
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as whole:
+        start = whole.find(TEXTS)
+        while start >= 0:
+            _check_heap(whole, start)
+            start = whole.find(TEXTS, start + len(TEXTS))
+
+
+def _check_heap(whole: mmap.mmap, start: int) -> None:
+    place = start + len(TEXTS)
+    end = start + int.from_bytes(whole[place : place + 8], "little")
+    place += 8
+    while end - place >= OBJECT.size and end <= len(whole):
+        index, _, _, size = OBJECT.unpack_from(whole, place)
+        place += size if index == 0 else OBJECT.size + size + -size % 8  # 0: what is free, itself included
+        if index == 0:
+            break
+    if end > len(whole) or not end - OBJECT.size < place <= end:
+        raise ValueError(f"the texts at byte {start} do not end where they should")
 
 
 def shortened(text: str) -> str:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 from small_results import UNIFORM_NM, small_compact, small_field, small_grid
 
-from sbrdf_jax import store
+from sbrdf_jax import hdf5, store
 from sbrdf_jax.cleaning import clean
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.evaluation import evaluate_in_chunks
@@ -281,6 +282,29 @@ def test_a_damaged_result_is_refused_in_one_line(tmp_path, result, damage):
     with h5py.File(path, "a") as file:
         damage(file)
     refused(path, "r.h5")
+
+
+@pytest.mark.parametrize("change", [8, 2**8, 2**60])
+def test_a_text_of_another_length_is_refused_before_the_library_follows_it(tmp_path, result, change):
+    path = tmp_path / "r.h5"
+    store.save(path, result)
+    whole = path.read_bytes()
+    heaps = [match.start() for match in re.finditer(re.escape(hdf5.TEXTS), whole)]
+    assert heaps
+    for heap in heaps:
+        damaged = bytearray(whole)
+        place = (
+            heap + 16 + 8
+        )  # the size of its first object; where the next one begins elsewhere, HDF5 may loop for ever
+        damaged[place : place + 8] = (int.from_bytes(damaged[place : place + 8], "little") + change).to_bytes(
+            8, "little"
+        )
+        path.write_bytes(damaged)
+        refused(path, f"the texts at byte {heap} do not end")
+    damaged = bytearray(whole)
+    damaged[heaps[0] + 8 : heaps[0] + 16] = len(whole).to_bytes(8, "little")
+    path.write_bytes(damaged)
+    refused(path, "do not end")
 
 
 def test_flipped_and_cut_bytes_are_refused_or_harmless(tmp_path, rng, result):

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 NOTHING = 1e-30  # of the largest diagonal element: a column that has died out, whose unknowns become 0
 WIDER = 6  # columns of a factor for each one more that a step adds to it
+TILE = 128  # of a matrix that is mirrored: both sides of it stay in the processor's cache
 RIDGE = 1e-6  # relative to the diagonal: what no value shows stays small, and directions between run not wild
 
 
@@ -112,9 +113,10 @@ class TensorFit:
         at = self.normal.theta_i @ u, self.normal.theta_o @ v
         matrix, right = _core_matrix(at, at, projection.gram), _core_right(at, projection.moment)
         core, root, scale = _solve(matrix, right)
-        gain = 2 * (core * right).sum(axis=0) - (core * (matrix @ core)).sum(axis=0)
+        right, known = scale[:, None] * right, core / scale[:, None]
+        gain = (known * (right + RIDGE * known)).sum(axis=0)
         value = core.reshape(u.shape[1], v.shape[1], projection.moment.shape[2], -1)
-        return SolvedCore(value, gain, at, projection, root, scale, scale[:, None] * right)
+        return SolvedCore(value, gain, at, projection, root, scale, right)
 
     def core_problem(self, factors: Factors) -> CoreProblem:
         """Return what decides on the core of given factors, for the channels that it has."""
@@ -155,15 +157,16 @@ class TensorFit:
         both = (known * (solved.right + RIDGE * known)).sum(axis=0)
         return both + (added * (right + diagonal[:, None] * added)).sum(axis=0) - solved.gain
 
-    def sweep(self, factors, channels: int) -> tuple[list[np.ndarray], float]:
-        """Renew the core and each factor once, by the first `channels` alone.
+    def sweep(self, factors, channels: int, solved: SolvedCore | None = None) -> tuple[list[np.ndarray], float]:
+        """Renew the core and each factor once, by the first `channels` alone; `solved` is the core, if it is known.
 
         Returns:
             The factors, and by how much those that were given lower the error.
         """
         u, v, w = factors
-        n, projection = self.normal, self.project(w)
-        solved = self.solve_core(u, v, projection)
+        n = self.normal
+        solved = self.solve_core(u, v, self.project(w)) if solved is None else solved
+        projection = solved.projection
         core = solved.value[..., :channels]
         gram, moment = projection.gram, projection.moment[..., :channels]
         a, b, q, c = core.shape
@@ -264,19 +267,36 @@ def _living(diagonal):
 
 
 def _scaled(matrix, right, ridge: float = RIDGE) -> CoreProblem:
-    """Scale the diagonal of normal equations to 1, and add a small ridge."""
+    """Scale the diagonal of normal equations to 1, and add a small ridge, in place: a core's matrix takes 26 MB."""
     scale = 1 / np.sqrt(_living(np.diag(matrix)))
-    return CoreProblem(matrix * scale[:, None] * scale + ridge * np.eye(len(matrix)), scale[:, None] * right, scale)
+    matrix *= scale[:, None]
+    matrix *= scale
+    matrix[np.diag_indices_from(matrix)] += ridge
+    return CoreProblem(matrix, scale[:, None] * right, scale)
 
 
 def _solve(matrix, right, ridge: float = RIDGE):
-    """Solve normal equations.
+    """Solve normal equations; their matrix, symmetric, is overwritten.
 
     Returns:
         The solution, the lower Cholesky factor of the scaled matrix, and the scale.
     """
     scaled, right, scale = _scaled(matrix, right, ridge)
-    root, found, failed = scipy.linalg.lapack.dposv(scaled, right, lower=1, overwrite_a=1, overwrite_b=1)
+    root, found, failed = scipy.linalg.lapack.dposv(scaled.T, right, lower=1, overwrite_a=1, overwrite_b=1)
     if failed:
         raise np.linalg.LinAlgError("normal equations are not positive definite")
     return scale[:, None] * found, root, scale
+
+
+def inverse_of(matrix: Float[np.ndarray, "cell cell"]) -> Float[np.ndarray, "cell cell"]:
+    """Return the inverse of a symmetric positive definite matrix, which is overwritten."""
+    root, failed = scipy.linalg.lapack.dpotrf(matrix.T, lower=1, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError("normal equations are not positive definite")
+    lower = scipy.linalg.lapack.dpotri(root, lower=1, overwrite_c=1)[0]
+    for start in range(0, len(lower), TILE):  # the upper triangle is the lower one, mirrored
+        end = start + TILE
+        lower[start:end, end:] = lower[end:, start:end].T
+        tile = lower[start:end, start:end]
+        tile[:] = np.tril(tile) + np.tril(tile, -1).T
+    return lower

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sbrdf_jax.representation.tensor_fit import Factors, TensorFit
+from sbrdf_jax.representation.tensor_fit import Factors, SolvedCore, TensorFit
 from sbrdf_jax.representation.tensor_pruning import num_words, prune
 
 KEPT = 0.5  # of the core's cells, as growth counts them: what pruning takes away costs hardly any error
@@ -73,7 +73,7 @@ def grow(
             if score >= ALIKE * steps[0][0] and fits(*trial):
                 factors, channels = trial
         factors, _ = fit.sweep(factors, channels)
-    factors = _settle(fit, factors, channels)
+    factors = _settle(fit, factors, channels, solved)
     settled = Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2])).value[..., :channels])
     if enough and not is_enough(settled):
         settled = found  # settled for all, not for the worst
@@ -102,11 +102,12 @@ def _steps(fit: TensorFit, found: Factors, most_channels: int) -> list[_Step]:
     return steps if found.core.shape[3] == most_channels else [*steps, _Step()]
 
 
-def _settle(fit: TensorFit, factors, channels: int) -> list[np.ndarray]:
-    """Sweep until the error hardly falls any more."""
+def _settle(fit: TensorFit, factors, channels: int, solved: SolvedCore | None = None) -> list[np.ndarray]:
+    """Sweep until the error hardly falls any more; `solved` is the core of the factors, if it is known."""
     before = np.inf
     for _ in range(MOST_SWEEPS):
-        factors, gained = fit.sweep(factors, channels)
+        factors, gained = fit.sweep(factors, channels, solved)
+        solved = None
         error = fit.normal.energy - gained
         if before - error <= SWEEP_GAIN * error:
             break

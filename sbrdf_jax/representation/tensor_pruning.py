@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Bool, Float, Int
 
-from sbrdf_jax.representation.tensor_fit import Factors, TensorFit
+from sbrdf_jax.representation.tensor_fit import Factors, TensorFit, inverse_of
 
 ROUND = 0.84  # of its cells keeps a core in one round: the losses of cells change with the cells that are left
 WORD = 64  # cells of which one stored number says whether they are there
@@ -86,7 +86,7 @@ class _Thinning:
     def __init__(self, fit: TensorFit, factors: Factors):
         matrix, _, self._scale = fit.core_problem(factors)
         self._factors = factors
-        inverse = np.linalg.inv(matrix)
+        inverse = inverse_of(matrix)
         values = factors.core.reshape(len(matrix), -1) / self._scale[:, None]
         self._channels = [_Channel(np.arange(len(matrix)), value, inverse) for value in values.T]
 
