@@ -293,8 +293,12 @@ def inverse_of(matrix: Float[np.ndarray, "cell cell"]) -> Float[np.ndarray, "cel
     root, failed = scipy.linalg.lapack.dpotrf(matrix.T, lower=1, overwrite_a=1)
     if failed:
         raise np.linalg.LinAlgError("normal equations are not positive definite")
-    lower = scipy.linalg.lapack.dpotri(root, lower=1, overwrite_c=1)[0]
-    for start in range(0, len(lower), TILE):  # the upper triangle is the lower one, mirrored
+    return mirrored(scipy.linalg.lapack.dpotri(root, lower=1, overwrite_c=1)[0])
+
+
+def mirrored(lower: Float[np.ndarray, "cell cell"]) -> Float[np.ndarray, "cell cell"]:
+    """Return a symmetric matrix of which the lower triangle is given, in place."""
+    for start in range(0, len(lower), TILE):
         end = start + TILE
         lower[start:end, end:] = lower[end:, start:end].T
         tile = lower[start:end, start:end]

@@ -68,11 +68,13 @@ def grow(
         if not steps:
             break
         steps.sort(key=lambda pair: -pair[0])
+        before = factors
         for score, step in steps:
             trial = step.taken(factors, channels)
             if score >= ALIKE * steps[0][0] and fits(*trial):
                 factors, channels = trial
-        factors, _ = fit.sweep(factors, channels)
+        is_same = all(one is other for one, other in zip(before, factors, strict=True))  # a channel more, no column
+        factors, _ = fit.sweep(factors, channels, solved if is_same else None)
     factors = _settle(fit, factors, channels, solved)
     settled = Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2])).value[..., :channels])
     if enough and not is_enough(settled):

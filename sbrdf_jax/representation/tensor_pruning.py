@@ -4,14 +4,16 @@ Factors are first turned so that the core's energy gathers in few cells; then ce
 rounds, and what is left is solved anew after each. A bit for each cell says where the stored ones lie.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy.linalg.blas
+import scipy.linalg.lapack
 from jaxtyping import Bool, Float, Int
 
-from sbrdf_jax.representation.tensor_fit import Factors, TensorFit, inverse_of
+from sbrdf_jax.representation.tensor_fit import Factors, TensorFit, inverse_of, mirrored
 
 ROUND = 0.84  # of its cells keeps a core in one round: the losses of cells change with the cells that are left
 WORD = 64  # cells of which one stored number says whether they are there
@@ -74,10 +76,16 @@ class _Channel(NamedTuple):
 
     def without(self, lost: Bool[np.ndarray, " left"]) -> "_Channel":
         """Take cells away and solve for the others anew, by a Schur complement of the inverse."""
-        left, across = ~lost, self.inverse[np.ix_(lost, ~lost)]
-        shares = scipy.linalg.solve(self.inverse[np.ix_(lost, lost)], across, assume_a="pos", check_finite=False)
-        inverse = self.inverse[np.ix_(left, left)] - across.T @ shares
-        return _Channel(self.cells[left], self.value[left] - self.value[lost] @ shares, inverse)
+        left, lost = np.flatnonzero(~lost), np.flatnonzero(lost)
+        if not len(left):
+            return _Channel(self.cells[left], self.value[left], self.inverse[:0, :0])
+        rows = self.inverse.take(lost, axis=0)
+        root = scipy.linalg.lapack.dpotrf(rows.take(lost, axis=1), lower=1)[0]
+        solve = functools.partial(scipy.linalg.blas.dtrsm, 1.0, root, lower=1)
+        across, value = solve(rows.take(left, axis=1)), solve(self.value[lost, None])
+        kept = self.inverse.take(left, axis=0).take(left, axis=1).T  # symmetric: the order of memory that BLAS takes
+        inverse = scipy.linalg.blas.dsyrk(-1.0, across, 1.0, kept, trans=1, lower=1, overwrite_c=1)
+        return _Channel(self.cells[left], self.value[left] - (value.T @ across)[0], mirrored(inverse))
 
 
 class _Thinning:
