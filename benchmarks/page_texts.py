@@ -36,8 +36,8 @@ incident angle, everything counted.""",
         "The whole pipeline",
         """\
 From samples to the compact form, a process for each row, so that its memory and compilation are its own. One
-size is swept at a time from the usual one; exponents are fitted to the largest three of each. float32 is left
-out: fits refuse it.""",
+size is swept at a time from the usual one; exponents are fitted to the largest three of each. In precision
+"mixed" the bounded solvers begin in float32 and end in float64, with the same certificate.""",
     ),
     "cold start": (
         "From nothing to a result",

@@ -36,6 +36,7 @@ class Case:
     wavelengths: int = 31
     incidences: int = 13
     threads: int = 1
+    precision: str = "float64"
     sweep: str = USUAL
 
 
@@ -49,6 +50,7 @@ def sweeps(methods: tuple[str, ...], cores: int) -> Iterator[Case]:
         yield from (Case(method, wavelengths=count, sweep="wavelengths") for count in (8, 101))
         yield from (Case(method, incidences=count, sweep="incident angles") for count in (4, 7))
         yield from (Case(method, threads=count, sweep="threads") for count in (2,) if count <= cores)
+        yield Case(method, step_deg=5.0, precision="float32", sweep="float32 first, nodes")
 
 
 def records(cases: Iterator[Case] | list[Case]) -> Iterator[Record]:
@@ -59,13 +61,14 @@ def records(cases: Iterator[Case] | list[Case]) -> Iterator[Record]:
         words = [sys.executable, "-m", "benchmarks.pipeline", json.dumps(dataclasses.asdict(case))]
         environment = os.environ | worker_environment(case.threads)
         done = subprocess.run(words, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-        found = json.loads(done.stdout.splitlines()[-1])
+        found, swept = json.loads(done.stdout.splitlines()[-1]), case.sweep.split(", ")[-1]
         yield record_of(
             Timing(found["first"], tuple(found["warm"]), found["peak_bytes"]),
             group="pipeline",
             problem="amber_glass",
             method=f"{case.method}, {case.threads} thread{'s' * (case.threads > 1)}",
-            setting=USUAL if case.sweep == USUAL else f"{case.sweep} {found['size'].get(case.sweep, case.threads)}",
+            setting=USUAL if case.sweep == USUAL else f"{case.sweep} {found['size'].get(swept, case.threads)}",
+            precision="float64" if case.precision == "float64" else "mixed",
             size=found["size"],
             error=found["error"],
             error_kind=ERROR_KIND,
@@ -89,6 +92,7 @@ def measure_case(case: Case) -> dict:
         "input: {path: 'builtin:amber_glass'}",
         f"grid: {{{grid}}}",
         f"resample: {{method: {case.method}}}",
+        f"runtime: {{precision: {case.precision}}}",
         represent,
     ]
     options = resolve(parse_config("\n".join(lines)))
