@@ -1,5 +1,7 @@
 """Footprints: counters in place of materials, what a scene reaches, and what is refused."""
 
+import dataclasses
+import os
 import subprocess
 import sys
 
@@ -7,10 +9,15 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
+from sbrdf_jax.builtin import measure
 from sbrdf_jax.cli import main
+from sbrdf_jax.config import parse_config, resolve
 from sbrdf_jax.errors import UserError
-from sbrdf_jax.footprints import PROBE, counters_in_place
-from sbrdf_jax.masks import read_mask, widen
+from sbrdf_jax.footprints import PROBE, counters_in_place, find_footprint
+from sbrdf_jax.masks import read_mask, widen, write_footprint
+from sbrdf_jax.pipeline import prepare, process
+from sbrdf_jax.progress import Progress
+from sbrdf_jax.resampling.kept import Kept
 
 PATCH = ROOT / "configs" / "scenes" / "flat_patch.xml"
 
@@ -57,6 +64,34 @@ def test_a_flat_patch_needs_few_directions(mitsuba_works, tmp_path):
     azimuth = np.degrees(mask.phi_o)[mask.needed.any(axis=(0, 1))]
     assert azimuth.max() == pytest.approx(180) and azimuth.min() > 60  # the camera looks from the mirror side
     assert (tmp_path / "patch.png").stat().st_size > 10_000
+
+
+def test_a_picture_of_what_was_needed_is_that_of_everything(mitsuba_works, tmp_path):
+    """Rendered with other samples than the footprint's; what was skipped is nan, and so is what it is read for."""
+    found = find_footprint(PATCH, width=48, samples=32)
+    write_footprint(tmp_path / "patch.h5", found.axes, found.counts)
+    raw, kept = measure("amber_glass", count=120), Kept()
+    raw = dataclasses.replace(raw, wavelength_nm=raw.wavelength_nm[::40], value=raw.value[:, ::40])
+    grids = {}
+    for name, scene in (("everything", "null"), ("needed", f"{{footprint: {tmp_path / 'patch.h5'}}}")):
+        options = resolve(parse_config("input: {path: 'builtin:amber_glass'}", [f"scene={scene}"]))
+        ready = prepare(raw, options, kept)
+        gridded = process(raw, ready, options, Progress(quiet=True), kept).gridded
+        whole = np.full((13, 13, 49, 3), np.nan)
+        whole[np.isin(np.round(ready.grid.theta_i, 9), np.round(gridded.theta_i, 9))] = gridded.brdf
+        grids[name] = whole[:, :, :25]
+    skipped = np.isnan(grids["needed"])
+    assert skipped.mean() > 0.9 and np.isfinite(grids["everything"]).all()
+    grids["spoiled"] = np.where(skipped, np.nan, 2 * grids["everything"])
+    np.savez(tmp_path / "grids.npz", **grids)
+    words = ["tests.picture", str(PATCH), str(tmp_path / "grids.npz"), str(tmp_path / "pictures.npy")]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-m", *words], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    whole, needed, spoiled = np.load(tmp_path / "pictures.npy")
+    assert np.isfinite(needed).all() and whole.max() > 0.01
+    assert np.abs(needed - whole).max() < 1e-6
+    assert np.abs(spoiled - whole).max() > 1e-3  # the material is what the picture shows
 
 
 def test_widening_adds_the_neighbours_of_a_cell():
