@@ -26,7 +26,9 @@ from sbrdf_jax.resampling.guided.nodes import (
     THETA,
     Features,
     ModeVariance,
+    analyse,
     axis_features,
+    cubic_rows,
     difference_features,
     features_of,
     synthesise,
@@ -178,30 +180,30 @@ def covariance_on_axes(
 
 
 def mode_sums(
-    centres: GroupedFeatures, dual: Float[AnyArray, "centre wavelength"]
-) -> dict[str, Float[AnyArray, "first second third wavelength"]]:
-    """Sum the centres' features, weighed by `dual`: A' in terms of modes, for each grid."""
-    xp, grouped = array_module(centres.half, dual), dual.reshape(*centres.half.shape[:2], -1)
+    at: Coordinates, dual: Float[np.ndarray, "centre wavelength"]
+) -> dict[str, Float[np.ndarray, "first second third wavelength"]]:
+    """Sum the modes of centres, weighed by `dual`, for each grid: A' a, given to the nodes and then to their modes."""
     sums = {}
-    for name, (_, axes) in POLAR_GRIDS.items():
-        by_group = xp.swapaxes(getattr(centres, name), 1, 2) @ grouped
-        modes = xp.tensordot(centres.theta_i, by_group, (0, 0))
-        modes = modes.reshape(axes[1].count, axes[0].count, axes[2].count, -1)
-        sums[name] = xp.moveaxis(modes, 0, 1)
-    lean, half, difference = centres.along
-    others, weighted = lean[:, :, None] * half[:, None, :], dual[:, :, None] * difference[:, None, :]
-    sums["difference"] = xp.moveaxis(xp.tensordot(others, weighted, (0, 0)), 2, 3)
+    for name, grid in GRIDS.items():
+        nodes = cubic_rows(grid.places(at), grid.axes).T @ dual
+        sums[name] = analyse(nodes.reshape(*(axis.count + 2 for axis in grid.axes), -1), grid.axes)
     return sums
 
 
 def node_values(
-    variance: ModeVariance, centres: GroupedFeatures, dual: Float[AnyArray, "centre wavelength"]
-) -> dict[str, Float[AnyArray, "first second third wavelength"]]:
-    """Return the nodes x = E^-1 A' a of each grid, from dual coefficients a."""
-    sums = mode_sums(centres, dual)
+    variance: ModeVariance, at: Coordinates, dual: Float[np.ndarray, "centre wavelength"]
+) -> dict[str, Float[np.ndarray, "first second third wavelength"]]:
+    """Return the nodes x = E^-1 A' a of each grid, from dual coefficients a, on the host.
+
+    Args:
+        variance: The prior E^-1.
+        at: Coordinates of the centres as the residual sees them, from `group_coordinates`, flattened.
+        dual: a.
+    """
+    sums = mode_sums(at, dual)
     if variance.reciprocal:
         for name in POLAR_GRIDS:
-            sums[name] = (sums[name] + array_module(dual).swapaxes(sums[name], 1, 2)) / 2
+            sums[name] = (sums[name] + np.swapaxes(sums[name], 1, 2)) / 2
         is_odd = np.arange(LEAN.count) % 2  # these modes change sign with theta_i - theta_o
         sums["difference"] = sums["difference"] * (1.0 - is_odd)[:, None, None, None]
     return {

@@ -274,10 +274,22 @@ def interpolate(
 
 
 def synthesise(
-    amplitude: Float[AnyArray, "first second third wavelength"], axes: tuple[Axis, Axis, Axis]
-) -> Float[AnyArray, "first second third wavelength"]:
+    amplitude: Float[np.ndarray, "first second third wavelength"], axes: tuple[Axis, Axis, Axis]
+) -> Float[np.ndarray, "first second third wavelength"]:
     """Return node values of a sum of modes."""
-    for place, axis in enumerate(axes):
-        amplitude = array_module(amplitude).tensordot(axis.modes, amplitude, (1, place))
-        amplitude = array_module(amplitude).moveaxis(amplitude, 0, place)
-    return amplitude
+    return _along_axes([axis.modes for axis in axes], amplitude)
+
+
+def analyse(
+    mirrored: Float[np.ndarray, "more more2 more3 wavelength"], axes: tuple[Axis, Axis, Axis]
+) -> Float[np.ndarray, "first second third wavelength"]:
+    """Return the sum of each mode's values at mirrored nodes, weighed by what is at them: `synthesise` transposed."""
+    return _along_axes([_mirrored_modes(axis).T for axis in axes], mirrored)
+
+
+def _along_axes(matrices: Sequence[np.ndarray], values: np.ndarray) -> np.ndarray:
+    """Multiply each of the first three axes of four by a matrix, without moving it."""
+    one, two, three = matrices
+    _, second, third, last = values.shape
+    values = (one @ values.reshape(len(values), -1)).reshape(len(one), second, -1)
+    return three @ (two @ values).reshape(len(one), len(two), third, last)
