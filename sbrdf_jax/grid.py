@@ -47,6 +47,12 @@ class Grid:
         """Distinct azimuths after folding."""
         return self.num_phi_o // 2 + 1 if self.bilateral else self.num_phi_o
 
+    @property
+    def key(self) -> bytes:
+        """What tells it from every other grid."""
+        ties = f"{self.bilateral}{self.interpolate_theta_i}{self.reciprocal}".encode()
+        return b"".join(np.asarray(axis).tobytes() for axis in (self.theta_i, self.theta_o, self.phi_o)) + ties
+
     @functools.cached_property
     def azimuth_index(self) -> np.ndarray:
         """[num_phi_o] the distinct azimuth of each azimuth round the circle."""

@@ -188,7 +188,7 @@ def test_covariance_and_nodes_equal_dense_matrices(rng, reciprocal):
     np.testing.assert_allclose(along_prior.reshape(-1), prior_variance(variance, flatten(mesh)), rtol=1e-10)
     dual = np.zeros((centres.count, 2))
     dual[seen] = rng.normal(size=(len(seen), 2))
-    nodes = node_values(variance, centres.snapped, dual)
+    nodes = node_values(variance, centres.node_rows, dual)
     read_back = sum(
         np.stack([
             interpolate(mirror(jnp.asarray(nodes[name])), jax.tree.map(lambda x, k=k: x[k], grid.places(at)), grid.axes)

@@ -56,9 +56,9 @@ def solved(monkeypatch):
     counts: dict[str, list[int]] = {"solved": [], "estimated": []}
     solve, estimate = guided.solve_field, guided.estimate
 
-    def count_solved(estimates, centres, needed, tolerance):
+    def count_solved(estimates, centres, needed, *args):
         counts["solved"].append(int(needed.sum()))
-        return solve(estimates, centres, needed, tolerance)
+        return solve(estimates, centres, needed, *args)
 
     def count_estimated(*args):
         counts["estimated"].append(1)

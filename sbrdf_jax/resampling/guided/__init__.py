@@ -139,14 +139,16 @@ def resample_guided(
         report("nodes")
     held = estimates.node_variance, centres.node_covariance
     nodes = read_nodes(fit.field, grid, fit.whiten, needs.node, known, *held)
-    theta_i = needs.theta_i
+    if grid.key not in centres.node_flags:
+        centres.node_flags[grid.key] = extrapolated_nodes(samples, grid)
+    flags, theta_i = centres.node_flags[grid.key], needs.theta_i
     return GriddedBRDF(
         theta_i=grid.theta_i[theta_i],
         theta_o=grid.theta_o,
         phi_o=grid.phi_o,
         wavelength_nm=samples.wavelength_nm[needs.wavelength],
         brdf=nodes.value,
-        extrapolated=extrapolated_nodes(samples, grid)[theta_i],
+        extrapolated=flags[theta_i],
         kkt_residual=fit.kkt_residual,
         num_steps=fit.num_steps,
         status=fit.status,

@@ -1,6 +1,7 @@
 """Where the samples are: merged, grouped by incident angle, padded: by angles alone, so that folds share it."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import scipy.sparse
@@ -19,7 +20,7 @@ from sbrdf_jax.resampling.guided.covariance import (
 )
 from sbrdf_jax.resampling.guided.inverse import lower_inverse
 from sbrdf_jax.resampling.guided.merging import merge_samples
-from sbrdf_jax.resampling.guided.nodes import ModeVariance
+from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, cubic_rows
 
 STEEPEST = np.deg2rad(85.0)
 MOST_GROUPS = 45  # more incident angles are sorted into so many bins
@@ -40,6 +41,7 @@ class Centres:
     features: GroupedFeatures
     reciprocal: bool  # nodes are tied by Helmholtz reciprocity
     node_covariance: dict[bytes, tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)  # by grid
+    node_flags: dict[bytes, np.ndarray] = dataclasses.field(default_factory=dict)  # `extrapolated_nodes`, by grid
     _prior: dict[int, tuple[ModeVariance, np.ndarray]] = dataclasses.field(default_factory=dict)
     _inverse: dict[tuple[int, float], np.ndarray] = dataclasses.field(default_factory=dict)
 
@@ -57,6 +59,11 @@ class Centres:
     def num_members(self) -> int:
         """Centres of each group, padding included."""
         return self.count // self.num_groups
+
+    @functools.cached_property
+    def node_rows(self) -> dict[str, scipy.sparse.csr_array]:
+        """Interpolation from each grid's mirrored nodes, A [centre, node]."""
+        return {name: cubic_rows(grid.places(self.snapped), grid.axes) for name, grid in GRIDS.items()}
 
     @property
     def group(self) -> np.ndarray:
@@ -84,7 +91,7 @@ class Centres:
     def take(self, row: np.ndarray) -> "Centres":
         """Return the centres for some of the rows: those left without a sample stay, and have no effect."""
         place = np.searchsorted(self.row, row)
-        return dataclasses.replace(self, row=row, index=self.index[place], _inverse={})
+        return dataclasses.replace(self, row=row, index=self.index[place], node_flags={}, _inverse={})
 
     @property
     def number(self) -> np.ndarray:

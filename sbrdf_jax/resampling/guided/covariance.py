@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import scipy.sparse
 from jaxtyping import Float
 
 from sbrdf_jax.array_module import AnyArray, array_module
@@ -28,7 +29,6 @@ from sbrdf_jax.resampling.guided.nodes import (
     ModeVariance,
     analyse,
     axis_features,
-    cubic_rows,
     difference_features,
     features_of,
     synthesise,
@@ -180,27 +180,27 @@ def covariance_on_axes(
 
 
 def mode_sums(
-    at: Coordinates, dual: Float[np.ndarray, "centre wavelength"]
+    rows: dict[str, scipy.sparse.csr_array], dual: Float[np.ndarray, "centre wavelength"]
 ) -> dict[str, Float[np.ndarray, "first second third wavelength"]]:
     """Sum the modes of centres, weighed by `dual`, for each grid: A' a, given to the nodes and then to their modes."""
     sums = {}
     for name, grid in GRIDS.items():
-        nodes = cubic_rows(grid.places(at), grid.axes).T @ dual
+        nodes = rows[name].T @ dual
         sums[name] = analyse(nodes.reshape(*(axis.count + 2 for axis in grid.axes), -1), grid.axes)
     return sums
 
 
 def node_values(
-    variance: ModeVariance, at: Coordinates, dual: Float[np.ndarray, "centre wavelength"]
+    variance: ModeVariance, rows: dict[str, scipy.sparse.csr_array], dual: Float[np.ndarray, "centre wavelength"]
 ) -> dict[str, Float[np.ndarray, "first second third wavelength"]]:
     """Return the nodes x = E^-1 A' a of each grid, from dual coefficients a, on the host.
 
     Args:
         variance: The prior E^-1.
-        at: Coordinates of the centres as the residual sees them, from `group_coordinates`, flattened.
+        rows: A, `Centres.node_rows`.
         dual: a.
     """
-    sums = mode_sums(at, dual)
+    sums = mode_sums(rows, dual)
     if variance.reciprocal:
         for name in POLAR_GRIDS:
             sums[name] = (sums[name] + np.swapaxes(sums[name], 1, 2)) / 2

@@ -41,7 +41,7 @@ def solve_field(
     parts = (estimates.inverse, estimates.noise, estimates.residual[:, needed], estimates.model[:, needed])
     bounded = solve_bounded(prior, *parts, ProjectedNewton(tolerance=tolerance, precision=precision))
     with one_blas_thread():
-        nodes = node_values(estimates.variance, centres.snapped, bounded.dual)
+        nodes = node_values(estimates.variance, centres.node_rows, bounded.dual)
     amplitude = estimates.lobe.log_amplitude
     shape = (3, centres.num_groups, centres.num_members)
     field = GuidedField(

@@ -57,15 +57,14 @@ def read_nodes(
     shape = (len(grid.theta_i), len(grid.theta_o), grid.num_azimuths)
     half = np.ones(shape, bool) if node is None else node[:, :, : grid.num_azimuths]
     axes = grid.theta_o, grid.phi_o[: shape[2]]
-    key = b"".join(np.asarray(a).tobytes() for a in (grid.theta_i, grid.theta_o, grid.phi_o))
-    variance = ({} if variances is None else variances).setdefault(key, np.full(shape, np.nan))
+    variance = ({} if variances is None else variances).setdefault(grid.key, np.full(shape, np.nan))
     value = np.full((2, *shape, len(field.wavelength_nm)), np.nan)
     fresh, lanes = half, np.ones(len(field.wavelength_nm), bool)
     if known is not None and known_rows(known, grid) is not None:
         fresh, lanes = _take_known(value, variance, half, grid, np.asarray(field.wavelength_nm), known)
     missing = half & np.isnan(variance)
     covariances = {} if covariances is None else covariances
-    _add_variances(variance, missing, field, whiten, grid.theta_i, axes, covariances, key + missing.tobytes())
+    _add_variances(variance, missing, field, whiten, grid.theta_i, axes, covariances, grid.key + missing.tobytes())
     for nodes, columns in ((fresh, np.arange(len(lanes))), (half & ~fresh, np.flatnonzero(lanes))):
         rows = np.flatnonzero(nodes.any(axis=(1, 2)))
         if not len(columns) or not len(rows):
