@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 MIRROR_AZIMUTH = np.pi
+SAME_ANGLE = 1e-9  # rad; closer angles are one: degrees in a file and back are not exact
+GRAZING = float(np.radians(85.0))  # beyond it a cosine that divides is that of this angle
 
 
 def wrap_azimuth(phi):

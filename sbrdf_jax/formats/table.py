@@ -4,14 +4,14 @@ import dataclasses
 
 import numpy as np
 
-from sbrdf_jax.angles import MIRROR_AZIMUTH, wrap_azimuth
+from sbrdf_jax.angles import GRAZING, MIRROR_AZIMUTH, wrap_azimuth
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.options import InputOptions
 from sbrdf_jax.records import RawSamples
 
 QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor", "relative")
 MIN_SAMPLES = 4
-MIN_COS = np.cos(np.radians(85.0))  # floor of the cosine that brdf_cos is divided by
+MIN_COS = np.cos(GRAZING)  # floor of the cosine that brdf_cos is divided by
 ANGLE_TOLERANCE = 1e-5  # rad; what rounding in a text file may add to a limit
 MAX_NUMBERS = 2**28  # of one file: 2 GiB as float64
 MAX_FILE_BYTES = 2**32

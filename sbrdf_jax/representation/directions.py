@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from sbrdf_jax.angles import fold_azimuth, wrap_azimuth
+from sbrdf_jax.angles import SAME_ANGLE, fold_azimuth, wrap_azimuth
 
-SAME_ANGLE = 1e-9  # rad; angles closer than this are one
 SAME_VALUE = 1e-12  # of the largest; mirror twins closer than this are equal
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from sbrdf_jax.angles import GRAZING, SAME_ANGLE
 from sbrdf_jax.evaluation import evaluate_where
 from sbrdf_jax.grid import has_data, midpoints
 from sbrdf_jax.records import GriddedBRDF, SpectralField
@@ -23,9 +24,7 @@ MIDWAY_WEIGHT = 0.1  # where it is interpolated between incident angles so far a
 WIDE_GAP = np.radians(15.0)  # so far; below it splines are better by the fourth power of the gap, and this counts less
 RELATIVE_SHARE = 0.03  # of the error relative to each direction's own energy
 RELATIVE_FLOOR = 1e-3  # of the mean energy of a direction
-SLACK = 1e-9  # rad
 SMOOTH = 1e-3  # of a logarithm: what is as even as that is even
-GRAZING = np.radians(85.0)  # beyond it nothing moves: cosines are floored there
 SMALLEST = 1e-9  # of the largest value; logarithms of less are not taken
 
 
@@ -101,7 +100,7 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
         for at_o, at_phi in ((mid_o, mid_phi), (every_o, near)):
             add(nodes.theta_i, at_o, at_phi, _interpolate_logarithm(nodes, at_o, at_phi), GUESS_WEIGHT * share)
         gaps = np.diff(nodes.theta_i)
-        if field.interpolate_theta_i and len(gaps) and np.ptp(gaps) < SLACK:
+        if field.interpolate_theta_i and len(gaps) and np.ptp(gaps) < SAME_ANGLE:
             phi = np.sort(np.concatenate([nodes.phi_o, mid_phi]))
             between = _between_incident_angles(nodes, share > 0, phi)
             trust = min(float(gaps[0] / WIDE_GAP), 1.0) ** 8
@@ -206,10 +205,12 @@ def _between_incident_angles(
     from scipy.ndimage import maximum_filter1d
 
     step = np.diff(nodes.theta_i).mean()
-    inner = nodes.theta_o[nodes.theta_o + step <= nodes.theta_o[-1] + SLACK] + step / 2  # both paths meet nodes there
+    inner = (
+        nodes.theta_o[nodes.theta_o + step <= nodes.theta_o[-1] + SAME_ANGLE] + step / 2
+    )  # both paths meet nodes there
     theta_o = np.unique(np.concatenate([inner, nodes.theta_o[[0, -1]]]))
     logarithm = _logarithm(nodes)
-    if nodes.theta_i[0] < SLACK:  # beyond the normal is the other side, seen from behind
+    if nodes.theta_i[0] < SAME_ANGLE:  # beyond the normal is the other side, seen from behind
         logarithm = np.concatenate([logarithm[2:0:-1, :, ::-1], logarithm])
         usable = np.concatenate([usable[2:0:-1], usable])
     along = PchipInterpolator(nodes.theta_o, logarithm, axis=1)
@@ -239,7 +240,7 @@ def _along_path(along, usable, above, theta_o, step: float, last: float) -> tupl
         at, row = theta_o + (number + 0.5) * step, above + number
         held = np.clip(row, 0, len(usable) - 1)
         value = along(np.clip(at, 0.0, last))[held]
-        value[:, (at < -SLACK) | (at > last + SLACK)] = np.nan
+        value[:, (at < -SAME_ANGLE) | (at > last + SAME_ANGLE)] = np.nan
         value[(row != held) | ~usable[held]] = np.nan
         six.append(value)
     values = np.stack(six)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from sbrdf_jax.representation.directions import SAME_ANGLE
+from sbrdf_jax.angles import SAME_ANGLE
 from sbrdf_jax.representation.lobe_family import SHAPES, lobe_shape_of_kind
 from sbrdf_jax.representation.lobe_harmonics_value import even_harmonics, even_orders
 

@@ -9,7 +9,7 @@ All lanes go on together; each has its own damping.
 import numpy as np
 from jaxtyping import Float, Int
 
-from sbrdf_jax.representation.directions import SAME_ANGLE
+from sbrdf_jax.angles import SAME_ANGLE
 from sbrdf_jax.representation.joint_fit import (
     DEPENDENT,
     NUM_LOBES,

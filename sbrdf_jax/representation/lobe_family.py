@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sbrdf_jax.angles import MIRROR_AZIMUTH, angle_between
+from sbrdf_jax.angles import GRAZING, MIRROR_AZIMUTH, angle_between
 from sbrdf_jax.lobes import lobe_exponents
 
 SHAPES = ("none", "angle_squared", "tan_squared", "tan", "half_gaussian", "half_exponential", "microfacet")
 FIRST_HALF_SHAPE = 4
-LOWEST_COSINE = float(np.cos(np.radians(85.0)))  # of theta_i and theta_o where a shape divides by them
+LOWEST_COSINE = float(np.cos(GRAZING))  # of theta_i and theta_o where a shape divides by them
 STEEPEST = 1e12  # tan^2 of the half angle: beyond it every shape is 0 or flat
 NARROWEST_DROP = 1000.0  # the narrowest lobe falls by this factor within one step of the grid
 WIDEST = (1.0, 30.0, 30.0, 30.0, 30.0, 30.0, 1.0)  # of each shape; no grid tells more from a constant and a slope

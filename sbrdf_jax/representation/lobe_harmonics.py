@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sbrdf_jax import colour
+from sbrdf_jax.angles import SAME_ANGLE
 from sbrdf_jax.encoding import decode, vector_basis
 from sbrdf_jax.options import ErrorBudget, RepresentOptions, TargetOptions
 from sbrdf_jax.records import GriddedBRDF, LobeHarmonics, LobeTensor, SpectralField, Status
 from sbrdf_jax.representation.allocation import Choice, angle_choices, make_ladder, spend
-from sbrdf_jax.representation.directions import SAME_ANGLE
 from sbrdf_jax.representation.half_field import HalfField, half_field
 from sbrdf_jax.representation.joint_fit import (
     NUM_LOBES,

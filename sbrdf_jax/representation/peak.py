@@ -5,10 +5,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from sbrdf_jax.angles import MIRROR_AZIMUTH, fold_azimuth
+from sbrdf_jax.angles import MIRROR_AZIMUTH, SAME_ANGLE, fold_azimuth
 from sbrdf_jax.lobes import LOBE_KINDS
 from sbrdf_jax.representation.critical_angle import CANDIDATES
-from sbrdf_jax.representation.directions import SAME_ANGLE, DirectionSet
+from sbrdf_jax.representation.directions import DirectionSet
 from sbrdf_jax.representation.lane_search import (
     Functions,
     LobeKinds,

@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sbrdf_jax.angles import SAME_ANGLE
 from sbrdf_jax.grid import Grid, second_difference_rows
 from sbrdf_jax.records import RawSamples, pytree
 from sbrdf_jax.sinc import azimuth_distance, polar_distance, sinc_weight
 
 CHUNK = 256  # samples whose rows are held at once
-SAME_ANGLE_RAD = 1e-9  # incident angles that differ by less share one kernel vector
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,7 +158,7 @@ class SampleTerms:
 
 def sample_terms(samples: RawSamples, grid: Grid) -> SampleTerms:
     """Sort samples by incident angle on the host: one group each, or one for all where there are many."""
-    exact = np.round(samples.theta_i / SAME_ANGLE_RAD).astype(np.int64)
+    exact = np.round(samples.theta_i / SAME_ANGLE).astype(np.int64)
     _, first, group = np.unique(exact, return_index=True, return_inverse=True)
     scattered = len(first) > len(grid.theta_i) ** 2
     incidence = np.asarray(theta_i_weights(samples.theta_i, grid))

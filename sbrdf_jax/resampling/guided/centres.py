@@ -6,7 +6,7 @@ import functools
 import numpy as np
 import scipy.sparse
 
-from sbrdf_jax.angles import fold_azimuth
+from sbrdf_jax.angles import GRAZING, fold_azimuth
 from sbrdf_jax.coverage import cluster_incidences
 from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.records import RawSamples
@@ -22,7 +22,6 @@ from sbrdf_jax.resampling.guided.inverse import lower_inverse
 from sbrdf_jax.resampling.guided.merging import merge_samples
 from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, cubic_rows
 
-STEEPEST = np.deg2rad(85.0)
 MOST_GROUPS = 45  # more incident angles are sorted into so many bins
 MEMBER_BUCKET = 8  # members of a group are padded to a multiple
 PADDING_NOISE = 1e12  # variance that leaves a centre without effect
@@ -111,7 +110,7 @@ def place_centres(samples: RawSamples, reciprocal: bool = False) -> Centres:
     measured = np.array([theta_i.max(), theta_o.max()])
     if reciprocal:
         measured[:] = measured.max()
-    limit = np.minimum(measured + EXTRAPOLATION, STEEPEST)
+    limit = np.minimum(measured + EXTRAPOLATION, GRAZING)
     azimuth = fold_azimuth(phi_o)
     half = guided_coordinates(theta_i, theta_o, azimuth, limit).half
     group_of_sample = group_incidences(theta_i)

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sbrdf_jax.angles import fold_azimuth
+from sbrdf_jax.angles import GRAZING, fold_azimuth
 from sbrdf_jax.array_module import AnyArray, array_module
 from sbrdf_jax.records import pytree
 
-COS_FLOOR = float(np.cos(np.deg2rad(85.0)))  # every cosine that divides or weighs is at least this
+COS_FLOOR = float(np.cos(GRAZING))  # every cosine that divides or weighs is at least this
 EXTRAPOLATION = np.deg2rad(10.0)  # beyond the measured range the field goes on so far, then stays
 POLE_BLEND = 0.005  # sin(theta_i) sin(theta_o) at which the azimuth has half of its effect
 COS_POWER = 0.25  # of both cosines, in the floor

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from sbrdf_jax.angles import SAME_ANGLE
 from sbrdf_jax.devices import on_host
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.records import GriddedBRDF
@@ -19,7 +20,6 @@ from sbrdf_jax.resampling.guided.field import (
 from sbrdf_jax.resampling.guided.lanes import take_field
 from sbrdf_jax.resampling.guided.on_axes import on_axes
 
-SAME_ANGLE = 1e-9  # rad; degrees in a file and back are not exact
 MOST_PENDING = 4096  # directions whose covariances with all centres are held at a time
 Covariances = tuple[np.ndarray, np.ndarray]  # prior ones [direction, centre], and prior variances [direction]
 
