@@ -74,7 +74,8 @@ def make_basis(wavelength_nm: Float[np.ndarray, " wavelength"], kind: str, coeff
         coefficients: Coefficients wanted; `coefficients_allowed` says how many are used, and why.
 
     Returns:
-        The basis, with the trapezoid rule of eq. (12) as the matrix `analysis`.
+        The basis, with the trapezoid rule of eq. (12) as the matrix `analysis`. Of unevenly spaced wavelengths, where
+        that rule does not even keep a constant, it is least squares of eq. (11) at the wavelengths.
 
     Raises:
         ValueError: wavelengths that do not increase, or what `coefficients_allowed` refuses.
@@ -89,11 +90,13 @@ def make_basis(wavelength_nm: Float[np.ndarray, " wavelength"], kind: str, coeff
     if kind == "identity":
         return SpectralBasis(wavelength_nm, np.eye(count), np.eye(count), kind, uniform=False)
     synthesis = _series(_position(wavelength_nm, wavelength_nm), kind, count, np)
+    uniform = bool(np.ptp(step) <= UNIFORM_TOLERANCE * step.mean())
+    if not uniform:
+        return SpectralBasis(wavelength_nm, np.linalg.pinv(synthesis), synthesis, kind, uniform=False)
     weight = np.convolve(step, [0.5, 0.5]) * 2 / (wavelength_nm[-1] - wavelength_nm[0])
     analysis = weight[:, None] * synthesis.T
     analysis[:, 0] *= 2  # the half of a_0 belongs to the synthesis
-    uniform = bool(np.ptp(step) <= UNIFORM_TOLERANCE * step.mean())
-    return SpectralBasis(wavelength_nm, analysis, synthesis, kind, uniform=uniform)
+    return SpectralBasis(wavelength_nm, analysis, synthesis, kind, uniform=True)
 
 
 def data_basis(
@@ -191,7 +194,7 @@ def encode(
         Coefficients [1/sr], in the order of `coefficient_names`.
 
     Numerics:
-        Where wavelengths are uniform by an FFT, else by the trapezoid weights as a matrix. A
+        Where wavelengths are uniform by an FFT, else by least squares as a matrix. A
         NaN spoils the coefficients of its own spectrum only.
     """
     count = basis.analysis.shape[1]

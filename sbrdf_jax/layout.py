@@ -117,7 +117,10 @@ def read_quadrature(group: h5py.Group, gridded: GriddedBRDF) -> Quadrature:
 def write_field(group: h5py.Group, field: SpectralField, grid: h5py.Group) -> None:
     """Write the spectral coefficients at the nodes of the grid."""
     names = coefficient_names(field.basis)
-    index = write_basis(group, field.basis, dataset_of(grid, "wavelength_nm"))
+    wavelength, own_nm = dataset_of(grid, "wavelength_nm"), np.asarray(field.basis.wavelength_nm)
+    if len(own_nm) != len(wavelength):  # without those that failed
+        wavelength = scale(group, "wavelength_nm", own_nm, "nm")
+    index = write_basis(group, field.basis, wavelength)
     axes = [dataset_of(grid, f"{name}_deg") for name in _ANGLES]
     written = dataset(group, "coefficients", field.coefficient, "1/sr", [*axes, index])
     written.attrs["basis"] = field.basis.kind
@@ -244,7 +247,8 @@ def _read_axes(group: h5py.Group, lanes: np.ndarray | slice = _EVERY) -> dict[st
 def read_field(group: h5py.Group, gridded: GriddedBRDF) -> SpectralField:
     """Read the spectral coefficients and their basis."""
     stored = dataset_of(group, "coefficients")
-    basis = read_basis(group, attribute(stored, "basis"), np.asarray(gridded.wavelength_nm), stored.shape[-1])
+    wavelength_nm = read(group, "wavelength_nm") if "wavelength_nm" in group else np.asarray(gridded.wavelength_nm)
+    basis = read_basis(group, attribute(stored, "basis"), wavelength_nm, stored.shape[-1])
     shape = (*np.shape(gridded.brdf)[:3], stored.shape[-1])
     return SpectralField(
         gridded.theta_i,

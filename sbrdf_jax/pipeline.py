@@ -28,6 +28,7 @@ from sbrdf_jax.runtime import compile_clock
 from sbrdf_jax.scene import find_needs, restrict_wavelengths
 from sbrdf_jax.store import RunResult
 from sbrdf_jax.summary import count_statuses
+from sbrdf_jax.symmetry import contradiction
 from sbrdf_jax.validation import validate
 
 FAILED = (Status.MAX_STEPS, Status.NONFINITE)
@@ -77,6 +78,16 @@ def prepare(raw: RawSamples, options: RunOptions, kept: Kept | None = None) -> P
     rows += plan_validation(folds)
     cost = predict_cost(cleaned.samples, grid, options, needs)
     warnings = [f"not measured: {text}" for text in cleaned.report.coverage.missing]
+    dark = needs.wavelength & ~dead & ~(cleaned.samples.value > 0).any(axis=0)
+    if dark.any():
+        names = ", ".join(f"{wavelength:g}" for wavelength in raw.wavelength_nm[dark])
+        warnings.append(f"no positive value at {names} nm: what is fitted there is 0")
+    difference = contradiction(cleaned.samples) if cleaned.report.bilateral else None
+    if difference is not None:
+        text = (
+            f"the two sides of the plane of incidence differ by {100 * difference:.2g} % at the median and were folded"
+        )
+        warnings.append(f"{text}; method paper keeps them apart with input.bilateral: false")
     if allowed.warning:
         warnings.append(allowed.warning)
     resume_from, earlier = options.runtime.resume_from, None

@@ -147,7 +147,8 @@ def compact_text(compact: CompactBRDF | LobeHarmonics | LobeTensor) -> str:
         count = np.shape(compact.degree)[1]
         lobes = lobe_counts(SHAPES[int(kind)] for kind in np.ravel(compact.lobe_kind) if kind)
         degree = int(np.max(compact.degree))
-        return f"even harmonics up to L = {degree}; lobes: {lobes}; {count} x {compact.basis.kind} spectra"
+        harmonics = f"even harmonics up to L = {degree}" if degree >= 0 else "no harmonics"
+        return f"{harmonics}; lobes: {lobes}; {count} x {compact.basis.kind} spectra"
     lobes = lobe_counts(LOBE_KINDS[int(kind)] for kind in np.ravel(compact.lobe_kind))
     return f"harmonics up to L = {compact.max_degree}; lobes: {lobes}"
 

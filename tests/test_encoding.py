@@ -43,8 +43,8 @@ def test_a_band_limited_spectrum_gives_the_integrals_of_eq_12(kind, rng):
 
 
 @pytest.mark.parametrize("kind", ["fourier", "cosine"])
-@pytest.mark.parametrize("wavelength_nm", [UNIFORM, UNEVEN], ids=["uniform", "uneven"])
-def test_encoding_is_the_trapezoid_rule_with_both_ends(kind, wavelength_nm, rng):
+def test_encoding_is_the_trapezoid_rule_with_both_ends(kind, rng):
+    wavelength_nm = UNIFORM
     spectrum = rng.uniform(size=(3, 2, wavelength_nm.size))
     basis = encoding.make_basis(wavelength_nm, kind, 19)
     position = (wavelength_nm - wavelength_nm[0]) / (wavelength_nm[-1] - wavelength_nm[0])
@@ -54,6 +54,17 @@ def test_encoding_is_the_trapezoid_rule_with_both_ends(kind, wavelength_nm, rng)
         expected = 2 * np.trapezoid(spectrum * series(position, unit, kind), position, axis=-1)
         np.testing.assert_allclose(encoding.encode(spectrum, basis)[..., k], expected, rtol=0, atol=TIGHT)
     np.testing.assert_allclose(encoding.encode(spectrum, basis), spectrum @ basis.analysis, rtol=0, atol=TIGHT)
+
+
+@pytest.mark.parametrize("kind", ["fourier", "cosine"])
+def test_uneven_wavelengths_are_least_squares(kind, rng):
+    spectrum = rng.uniform(size=(3, 2, UNEVEN.size))
+    basis = encoding.make_basis(UNEVEN, kind, 19)
+    rows = np.asarray(basis.synthesis).T
+    expected = np.linalg.lstsq(rows, spectrum.reshape(6, -1).T)[0].T.reshape(3, 2, 19)
+    np.testing.assert_allclose(encoding.encode(spectrum, basis), expected, rtol=0, atol=1e-9)
+    few = encoding.make_basis(np.array([400.0, 410.0, 420.0, 440.0, 700.0]), kind, 3)
+    np.testing.assert_allclose(encoding.decode(encoding.encode(np.ones(5), few), few), 1.0, rtol=1e-12)
 
 
 def test_uniform_to_a_millionth_takes_the_fft():

@@ -16,6 +16,7 @@ from problems import scattered_samples
 
 from sbrdf_jax.cli import main
 from sbrdf_jax.formats import write_samples
+from sbrdf_jax.store import load
 
 SMALL_GRID = ["grid.theta_i_step_deg=30", "grid.theta_o_step_deg=22.5", "grid.phi_o_step_deg=45"]
 FAST = [
@@ -134,9 +135,43 @@ def test_a_dead_wavelength_is_exit_code_3_and_flagged(folder, capsys):
     (folder / "dead.yaml").write_text("input:\n  path: dead.h5\n")
     assert main(["run", str(folder / "dead.yaml"), *FAST, f"output.path={folder / 'dead_out.h5'}"]) == 3
     assert "550 nm" in capsys.readouterr().err
+    whole = load(folder / "dead_out.h5")
+    assert len(whole.field.basis.wavelength_nm) == 8 and np.isfinite(whole.field.coefficient).all()
     with h5py.File(folder / "dead_out.h5") as file:
         assert list(np.flatnonzero(file["grid/status"][()])) == [4]
         assert np.isfinite(file["grid/brdf"][..., :4]).all()
+
+
+@pytest.mark.parametrize("methods", [[], ["resample.method=paper", "represent.method=paper"]], ids=["default", "paper"])
+def test_a_dead_wavelength_has_a_report_and_can_be_read(folder, methods):
+    samples = scattered_samples(np.random.default_rng(3), [0.0, 30.0, 60.0], 60, 9)
+    samples.value[:, 4] = np.nan
+    write_samples(folder / "dead.h5", samples)
+    (folder / "dead.yaml").write_text("input:\n  path: dead.h5\n")
+    words = ["run", str(folder / "dead.yaml"), *SMALL_GRID, *methods, f"output.path={folder / 'reported.h5'}"]
+    assert main([*words, "output.overwrite=true"]) == 3
+    found = load(folder / "reported.h5")
+    assert 550.0 not in found.field.basis.wavelength_nm and found.gridded.brdf.shape[-1] == 9
+    assert list((folder / "reported_report").glob("*.html"))
+
+
+def test_what_a_user_would_not_guess_is_a_warning(folder, capsys):
+    samples = scattered_samples(np.random.default_rng(3), [0.0, 30.0, 60.0], 150, 5)
+    samples.value[:, 2] *= -1
+    samples.value[:] *= 1 + 0.5 * np.sin(samples.phi_o)[:, None]
+    write_samples(folder / "odd.h5", samples)
+    (folder / "odd.yaml").write_text("input:\n  path: odd.h5\n")
+    words = [
+        *SMALL_GRID,
+        "output.report=false",
+        "represent.target={numbers: 5}",
+        f"output.path={folder / 'odd_out.h5'}",
+    ]
+    assert main(["run", str(folder / "odd.yaml"), *words]) == 0
+    said = capsys.readouterr().err
+    assert "no positive value at 550 nm" in said
+    assert "the two sides of the plane of incidence differ by" in said
+    assert "so few numbers leave an error of" in said
 
 
 def _lines(folder, name: str, change) -> None:

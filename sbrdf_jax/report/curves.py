@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from sbrdf_jax.encoding import decode
-from sbrdf_jax.evaluation import evaluate_in_chunks
+from sbrdf_jax.evaluation import evaluate_in_chunks, measured_wavelengths
 from sbrdf_jax.metrics import CHUNK_SIZE
-from sbrdf_jax.records import CompactBRDF, GriddedBRDF, RawSamples, SpectralField
+from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, RawSamples, SpectralField
 from sbrdf_jax.report.fine_grid import FineGrid, RingEffect, pick_wavelength
 from sbrdf_jax.report.lobe_fits import KindFit
 from sbrdf_jax.report.style import BLUE, INK, LINES, MUTED, SERIES, VERMILLION, new_figure, plane_axis
@@ -117,7 +117,12 @@ def lobe_kinds(fine: FineGrid, gridded: GriddedBRDF, fits: Sequence[KindFit]) ->
     return figure
 
 
-def spectra(gridded: GriddedBRDF, field: SpectralField, compact: CompactBRDF | None, places: Sequence) -> Any:
+def spectra(
+    gridded: GriddedBRDF,
+    field: SpectralField,
+    compact: CompactBRDF | LobeHarmonics | LobeTensor | None,
+    places: Sequence,
+) -> Any:
     """Figure 11: spectra at nodes and what the encoding and the compact form make of them.
 
     Args:
@@ -136,14 +141,16 @@ def spectra(gridded: GriddedBRDF, field: SpectralField, compact: CompactBRDF | N
     at = np.array(places)
     angles = [np.asarray(a, float)[at[:, k]] for k, a in enumerate((gridded.theta_i, gridded.theta_o, gridded.phi_o))]
     rebuilt = None if compact is None else evaluate_in_chunks(compact, *angles, chunk_size=CHUNK_SIZE)
+    encoded = np.asarray(field.basis.wavelength_nm)  # without those that failed
     series = np.asarray(decode(np.asarray(field.coefficient)[tuple(at.T)], field.basis))
     for number, axes in enumerate(panels):
         original = np.asarray(gridded.brdf)[tuple(at[number])]
         axes.plot(wavelength, original, color=INK, linewidth=2.4, marker=marker, markersize=3.5, label="orig (grid)")
         label = f"{field.basis.kind}, {np.shape(field.basis.synthesis)[0]} coefficients"
-        axes.plot(wavelength, series[number], color=SERIES[0], linestyle=LINES[1], label=label)
-        if rebuilt is not None:
-            axes.plot(wavelength, rebuilt[number], color=SERIES[1], linestyle=LINES[2], label="compact form")
+        axes.plot(encoded, series[number], color=SERIES[0], linestyle=LINES[1], label=label)
+        if compact is not None and rebuilt is not None:
+            own = np.asarray(measured_wavelengths(compact))
+            axes.plot(own, rebuilt[number], color=SERIES[1], linestyle=LINES[2], label="compact form")
         theta_i, theta_o, phi_o = (np.degrees(angle[number]) for angle in angles)
         azimuth = "" if theta_o == 0 else f", {phi_o:.4g}°"
         axes.set_title(f"$\\theta_i$ = {theta_i:.4g}°,  out ({theta_o:.4g}°{azimuth})", fontsize=10.5)

@@ -43,7 +43,8 @@ def fit_lobe_kinds(
         coefficient=jnp.asarray(field.coefficient)[one],
         interpolate_theta_i=False,
     )
-    original = np.asarray(gridded.brdf)[incidence]
+    live = np.isin(np.asarray(gridded.wavelength_nm), np.asarray(field.basis.wavelength_nm))
+    original = np.asarray(gridded.brdf)[incidence][..., live]
     fits = []
     for degree in degrees:
         for kind in LOBE_KINDS[1:]:

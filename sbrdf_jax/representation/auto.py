@@ -64,7 +64,8 @@ def _ruled_out(
     most = target.budget if target.is_size else stored if plan["is_met"] else np.inf
     least = lobe_harmonics.least_numbers(tensor)
     if least >= most:
-        return f"it takes at least {least / np.size(tensor.theta_i):.3g} numbers for each incident angle"
+        numbers = least / np.size(tensor.theta_i)
+        return f"with a lobe and a constant at each incident angle it takes {numbers:.3g} numbers for each"
     asked = plan["worst"] if target.is_size else target.value
     if plan["is_met"] and target.kind != "delta_e" and asked <= LEAST_ERROR:
         return f"its worst incident angle is hardly ever below {100 * LEAST_ERROR:g} %"

@@ -28,6 +28,7 @@ from sbrdf_jax.splines import spline_weights
 
 MOST_FUNCTIONS = 13  # of one polar angle; the factors are smooth, however fine the grid
 ASYMMETRIC = 0.01  # relative size of the part odd in phi_o from which a user is told that it is dropped
+USELESS = 0.5  # error at the worst incident angle from which a user is told that a size was too small
 MOST_BETWEEN = 5.0  # times a target's error may be that between the nodes, of a field that is known there
 
 
@@ -247,6 +248,12 @@ def make_plan(target: Target, achieved: float, worst: float, half: HalfField) ->
     warnings = []
     if not met:
         warnings.append(f"compact: the target, {target.text}, is not met: {in_words(target, achieved)} is the best")
+    if target.is_size and worst > USELESS:
+        says = f"compact: so few numbers leave an error of {100 * worst:.3g} % at the worst incident angle"
+        warnings.append(f"{says}; represent.target: {{error: 0.02}} would take what it needs")
+    for stop in target.stops:
+        if target.is_size and stop.kind == "error" and not is_met(stop, worst):
+            warnings.append(f"compact: scene.error_budget, {stop.text}, is not met: {in_words(stop, worst)} is reached")
     if half.asymmetry > ASYMMETRIC:
         share = f"{100 * half.asymmetry:.2g} %"
         warnings.append(f"compact: {share} of the field is not symmetric to the plane of incidence and was dropped")

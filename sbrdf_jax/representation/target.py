@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sbrdf_jax import colour
-from sbrdf_jax.options import ErrorBudget, TargetOptions
+from sbrdf_jax.options import ErrorBudget, RepresentOptions, TargetOptions
 
 PAPER_DIRECTIONS = 13 * 49  # the paper's nodes of one incident angle, copies at the pole and at 360 degrees counted
 
@@ -48,8 +48,11 @@ def make_target(
 ) -> Target:
     """Return the target that the options give, for a grid; of a target and a scene's budget the stricter.
 
-    A budget of numbers and one of error hold both: what is reached first ends the search.
+    A budget of numbers and one of error hold both: what is reached first ends the search. The default size, which
+    nobody asked for, gives way to a budget.
     """
+    if budget is not None and options == RepresentOptions().target:
+        options = TargetOptions(**vars(budget))
     kind, value = _given(options)
     enough = {kind: value} if kind in ("error", "delta_e") else {}
     if budget is not None:
