@@ -24,9 +24,14 @@ if TYPE_CHECKING:
     from sbrdf_jax.grid import make_grid as make_grid
     from sbrdf_jax.harmonics import real_harmonics as real_harmonics
     from sbrdf_jax.lobes import lobe_value as lobe_value
+    from sbrdf_jax.nnls import DenseNormal as DenseNormal
+    from sbrdf_jax.nnls import ProjectedNewton as ProjectedNewton
     from sbrdf_jax.nnls import solve_nnls as solve_nnls
+    from sbrdf_jax.options import InputOptions as InputOptions
+    from sbrdf_jax.options import RunOptions as RunOptions
     from sbrdf_jax.pipeline import prepare as prepare
     from sbrdf_jax.pipeline import process as process
+    from sbrdf_jax.progress import Progress as Progress
     from sbrdf_jax.records import CompactBRDF as CompactBRDF
     from sbrdf_jax.records import GriddedBRDF as GriddedBRDF
     from sbrdf_jax.records import LobeHarmonics as LobeHarmonics
@@ -51,8 +56,10 @@ _HOME = {
     "grid": ("make_grid",),
     "harmonics": ("real_harmonics",),
     "lobes": ("lobe_value",),
-    "nnls": ("solve_nnls",),
+    "nnls": ("DenseNormal", "ProjectedNewton", "solve_nnls"),
+    "options": ("InputOptions", "RunOptions"),
     "pipeline": ("prepare", "process"),
+    "progress": ("Progress",),
     "records": ("CompactBRDF", "GriddedBRDF", "LobeHarmonics", "LobeTensor", "RawSamples", "SpectralField", "Status"),
     "representation": ("represent",),
     "resampling": ("resample",),

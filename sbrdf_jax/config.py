@@ -13,7 +13,7 @@ from typing import Any
 
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.option_checks import check_options, describe, option_at
-from sbrdf_jax.options import ErrorBudget, OutgoingOptions, RunOptions, TargetOptions
+from sbrdf_jax.options import DEFAULT_VECTORS, ErrorBudget, OutgoingOptions, RunOptions, TargetOptions
 from sbrdf_jax.yaml_tree import KeyPath, Tree, dotted, dump_yaml, graft, parse_yaml
 
 # A row goes when its method arrives: key, which values are refused, and what there is.
@@ -30,7 +30,7 @@ AUTO_RESAMPLE: dict[str, dict[str, Any]] = {
     "guided": {"smoothness_weight": "data", "tolerance": 1e-6},
 }
 AUTO_BASIS = {"paper": "fourier"}  # else data
-AUTO_COEFFICIENTS = {"data": 12}  # else 19, as in the paper
+AUTO_COEFFICIENTS = {"data": DEFAULT_VECTORS}  # else 19, as in the paper
 AUTO_DEGREE = {"paper": 4}  # else 8
 
 BUILTIN = "builtin:"

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from sbrdf_jax.array_module import AnyArray, array_module
 from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.interpolation import spectral_weights
+from sbrdf_jax.options import DEFAULT_VECTORS
 from sbrdf_jax.records import GriddedBRDF, SpectralBasis, SpectralField
 
 BASIS_KINDS = ("fourier", "cosine", "data", "identity")
@@ -54,7 +55,9 @@ def coefficients_allowed(num_wavelengths: int, wanted: int, kind: str = "fourier
         text = f"{num_wavelengths} wavelengths are too few for a series: the samples themselves are stored"
         return AllowedBasis("identity", num_wavelengths, text)
     if kind == "data":
-        return AllowedBasis(kind, min(wanted, num_wavelengths), None)
+        used = min(wanted, num_wavelengths)
+        text = f"{used} spectral coefficients in place of {wanted}: there are no more wavelengths"
+        return AllowedBasis(kind, used, text if used < wanted and wanted != DEFAULT_VECTORS else None)
     most = num_wavelengths - 1 - num_wavelengths % 2  # the largest odd number up to n - 1
     used = min(wanted, most)
     if kind == "fourier" and used % 2 == 0:  # a cosine without its sine has no place in eq. (11)

@@ -133,7 +133,9 @@ def done_table(result: RunResult) -> Table:
     for stage, suffix in (("grid", "_grid"), ("compact", "")):
         if f"negative_share{suffix}" in result.metrics:
             share, depth = (float(result.metrics[f"negative_{what}{suffix}"]) for what in ("share", "depth"))
-            rows.append((f"{stage} < 0", f"{100 * share:.2g} % of values off the nodes, deepest {-depth:.2g} 1/sr"))
+            rows.append(
+                (f"{stage} < 0", f"{100 * share:.2g} % of values off the nodes, deepest {0.0 - depth:.2g} 1/sr")
+            )
     return Table("What was done", ("", ""), tuple(rows))
 
 
