@@ -193,11 +193,26 @@ def read_mapping(group: h5py.Group, without: Collection[str] = ()) -> dict[str, 
     return found
 
 
+def one_line_errors(read):
+    """Turn whatever a damaged file makes h5py or NumPy raise into one line that names the file."""
+
+    @functools.wraps(read)
+    def wrapped(path, *args, **kwargs):
+        try:
+            return read(path, *args, **kwargs)
+        except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, ArithmeticError) as error:
+            reason = shortened(" ".join(str(error).split()))
+            raise UserError(f"{path}: the result cannot be read, it is damaged: {reason}") from error
+
+    return wrapped
+
+
+@one_line_errors
 def check_texts(path: str | os.PathLike) -> None:
     """Look whether the heaps of texts of an HDF5 file are whole: no checksum covers them, and the library may loop.
 
     Raises:
-        ValueError: One is damaged: its objects do not end where it ends.
+        UserError: One is damaged: its objects do not end where it ends.
     """
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as whole:
         start = whole.find(TEXTS)
@@ -222,17 +237,3 @@ def _check_heap(whole: mmap.mmap, start: int) -> None:
 def shortened(text: str) -> str:
     """Return the first part of a long text: what a damaged file says of itself may have any length."""
     return text if len(text) <= LONGEST_REASON else text[: LONGEST_REASON - 3] + "..."
-
-
-def one_line_errors(read):
-    """Turn whatever a damaged file makes h5py or NumPy raise into one line that names the file."""
-
-    @functools.wraps(read)
-    def wrapped(path, *args, **kwargs):
-        try:
-            return read(path, *args, **kwargs)
-        except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, ArithmeticError) as error:
-            reason = shortened(" ".join(str(error).split()))
-            raise UserError(f"{path}: the result cannot be read, it is damaged: {reason}") from error
-
-    return wrapped

@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 
 from sbrdf_jax.errors import UserError
-from sbrdf_jax.hdf5 import attribute, check_texts, one_line_errors, shortened
+from sbrdf_jax.hdf5 import attribute, check_texts, shortened
 
 SCHEMA_NAME = "sbrdf-result"
 SCHEMA_VERSION = 1
@@ -24,7 +24,7 @@ def open_result(path: str | os.PathLike):
         raise UserError(f"{path}: no such file, expected a result of sbrdf_jax")
     if not h5py.is_hdf5(path):
         raise UserError(f"{path}: not an HDF5 file or cut off, expected a result of sbrdf_jax")
-    one_line_errors(check_texts)(path)
+    check_texts(path)
     with h5py.File(path, "r") as file:
         found = file.attrs.get("schema_name")
         if found != SCHEMA_NAME:

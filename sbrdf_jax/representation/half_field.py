@@ -205,9 +205,8 @@ def _between_incident_angles(
     from scipy.ndimage import maximum_filter1d
 
     step = np.diff(nodes.theta_i).mean()
-    inner = (
-        nodes.theta_o[nodes.theta_o + step <= nodes.theta_o[-1] + SAME_ANGLE] + step / 2
-    )  # both paths meet nodes there
+    inside = nodes.theta_o + step <= nodes.theta_o[-1] + SAME_ANGLE
+    inner = nodes.theta_o[inside] + step / 2  # both paths meet nodes there
     theta_o = np.unique(np.concatenate([inner, nodes.theta_o[[0, -1]]]))
     logarithm = _logarithm(nodes)
     if nodes.theta_i[0] < SAME_ANGLE:  # beyond the normal is the other side, seen from behind

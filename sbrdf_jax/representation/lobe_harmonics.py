@@ -110,10 +110,10 @@ def represent(
     Numerics:
         As for `lobe_tensor`: the clip at 0 comes last, and what is odd in phi_o is dropped.
     """
-    if budget is not None and options.target.error is None and options.target.delta_e is None:
+    target = make_target(options.target, np.size(field.theta_i), np.size(field.basis.wavelength_nm), budget)
+    if budget is not None and target.is_size:
         enough = TargetOptions(**vars(budget))
         small = represent(field, dataclasses.replace(options, target=enough), gridded, matching)
-        target = make_target(options.target, len(np.asarray(field.theta_i)), np.size(field.basis.wavelength_nm))
         if small[1]["is_met"] and stored_numbers(small[0]) <= target.budget:
             return small
     theta_i, theta_o = np.asarray(field.theta_i, np.float64), np.asarray(field.theta_o, np.float64)
@@ -121,7 +121,6 @@ def represent(
         decode(np.asarray(field.coefficient, np.float64), field.basis) if gridded is None else gridded.brdf
     )
     half = half_field(field, brdf, gridded)
-    target = make_target(options.target, len(theta_i), np.size(field.basis.wavelength_nm), budget)
     max_degree = DEFAULT_MAX_DEGREE if options.max_degree == "auto" else options.max_degree
     status = np.where(np.isfinite(brdf).all(axis=(1, 2, 3)), int(Status.SKIPPED), int(Status.NONFINITE))
     status = np.where(half.known, int(Status.OK), status)

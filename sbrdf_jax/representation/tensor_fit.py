@@ -290,10 +290,19 @@ def _solve(matrix, right, ridge: float = RIDGE):
 
 def inverse_of(matrix: Float[np.ndarray, "cell cell"]) -> Float[np.ndarray, "cell cell"]:
     """Return the inverse of a symmetric positive definite matrix, which is overwritten."""
+    return mirrored(scipy.linalg.lapack.dpotri(lower_root(matrix), lower=1, overwrite_c=1)[0])
+
+
+def lower_root(matrix: Float[np.ndarray, "cell cell"]) -> Float[np.ndarray, "cell cell"]:
+    """Return the lower Cholesky factor of a symmetric matrix, which is overwritten.
+
+    Raises:
+        LinAlgError: It is not positive definite.
+    """
     root, failed = scipy.linalg.lapack.dpotrf(matrix.T, lower=1, overwrite_a=1)
     if failed:
         raise np.linalg.LinAlgError("normal equations are not positive definite")
-    return mirrored(scipy.linalg.lapack.dpotri(root, lower=1, overwrite_c=1)[0])
+    return root
 
 
 def mirrored(lower: Float[np.ndarray, "cell cell"]) -> Float[np.ndarray, "cell cell"]:

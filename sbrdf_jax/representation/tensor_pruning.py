@@ -10,10 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg.blas
-import scipy.linalg.lapack
 from jaxtyping import Bool, Float, Int
 
-from sbrdf_jax.representation.tensor_fit import Factors, TensorFit, inverse_of, mirrored
+from sbrdf_jax.representation.tensor_fit import Factors, TensorFit, inverse_of, lower_root, mirrored
 
 ROUND = 0.84  # of its cells keeps a core in one round: the losses of cells change with the cells that are left
 WORD = 64  # cells of which one stored number says whether they are there
@@ -80,7 +79,7 @@ class _Channel(NamedTuple):
         if not len(left):
             return _Channel(self.cells[left], self.value[left], self.inverse[:0, :0])
         rows = self.inverse.take(lost, axis=0)
-        root = scipy.linalg.lapack.dpotrf(rows.take(lost, axis=1), lower=1)[0]
+        root = lower_root(rows.take(lost, axis=1))
         solve = functools.partial(scipy.linalg.blas.dtrsm, 1.0, root, lower=1)
         across, value = solve(rows.take(left, axis=1)), solve(self.value[lost, None])
         kept = self.inverse.take(left, axis=0).take(left, axis=1).T  # symmetric: the order of memory that BLAS takes
