@@ -131,6 +131,7 @@ def _write_tensor(writer: _Writer, tensor: LobeTensor) -> None:
     group = writer.group
     group.attrs["method"] = "lobe_tensor"
     group.attrs["half_angle_floor"] = tensor.half_angle_floor
+    group.attrs["direction_functions"] = "splines of the half angle, azimuth, Fresnel"
     axes = {"coefficient": write_basis(group, tensor.basis, dataset_of(group, "wavelength_nm"), tensor.storage)}
     for name, names in _FACTORS.items():
         value = np.asarray(getattr(tensor, name))
@@ -155,6 +156,8 @@ def _read_tensor(group: h5py.Group) -> LobeTensor:
     theta_i, wavelength_nm = read(group, "theta_i_deg"), read(group, "wavelength_nm")
     sizes = {axis: len(read(group, axis)) for names in (*_FACTORS.values(), _CORE) for axis in names}
     factors = {name: read(group, name, tuple(sizes[axis] for axis in names)) for name, names in _FACTORS.items()}
+    if "direction_functions" not in group.attrs:  # results of earlier versions lack the last function
+        factors["direction_factor"] = np.pad(factors["direction_factor"], ((0, 1), (0, 0)))
     shape = tuple(sizes[axis] for axis in _CORE)
     if "core_stored" in group:
         words = read_as_written(group, "core_stored", (num_words(int(np.prod(shape))),))

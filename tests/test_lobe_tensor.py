@@ -18,7 +18,7 @@ from sbrdf_jax.grid import make_grid
 from sbrdf_jax.metrics import compression, error_at_nodes, error_between, on_axes, stored_numbers
 from sbrdf_jax.options import GridOptions, RepresentOptions, ResampleOptions, TargetOptions
 from sbrdf_jax.records import GriddedBRDF, SpectralField, Status
-from sbrdf_jax.representation import represent, represent_with_plan
+from sbrdf_jax.representation import represent, represent_with_plan, tensor_growth
 from sbrdf_jax.representation.direction_functions import direction_functions, num_direction_functions
 from sbrdf_jax.representation.half_field import half_field, near_mirror
 from sbrdf_jax.representation.tensor_fit import Factors, Normal, TensorFit
@@ -87,16 +87,19 @@ def test_splines_are_those_of_scipy(count, rng):
 
 def test_direction_functions_know_no_azimuth_at_the_poles_and_are_finite_at_grazing(rng):
     floor = 1e-4
+    count = num_direction_functions(floor, is_field=False)
     phi = rng.uniform(0, 6, 5)
     zero, other = np.zeros(5), np.full(5, 0.7)
     for theta_i, theta_o in ((zero, other), (other, zero)):
-        found = direction_functions(theta_i, theta_o, phi, floor)
-        assert found.shape == (5, num_direction_functions(floor))
+        found = direction_functions(theta_i, theta_o, phi, floor, count)
+        assert found.shape == (5, count)
         assert np.abs(found - found[:1]).max() < ROUND
     grazing, mirror = np.full(1, np.pi / 2), np.full(1, np.pi)
-    found = direction_functions(grazing, grazing, mirror, floor)
-    expected = direction_functions(np.full(1, 0.3), np.full(1, 0.3), mirror, floor)  # half angle 0 alike
-    assert np.abs(found - expected)[0, :-3].max() < ROUND
+    found = direction_functions(grazing, grazing, mirror, floor, count)
+    expected = direction_functions(np.full(1, 0.3), np.full(1, 0.3), mirror, floor, count)  # half angle 0 alike
+    assert np.abs(found - expected)[0, :-4].max() < ROUND
+    assert found[0, -1] == pytest.approx(1.0, abs=1e-5)  # all is reflected
+    assert direction_functions(np.zeros(1), np.zeros(1), mirror, floor, count)[0, -1] == pytest.approx(0.0, abs=ROUND)
 
 
 def test_each_step_is_plain_least_squares(rng):
@@ -106,7 +109,7 @@ def test_each_step_is_plain_least_squares(rng):
     value, weight = rng.normal(size=(num_i, num_o, num_phi, channels)), rng.uniform(0.5, 2, (num_i, num_o, num_phi))
     gram = np.einsum("iop,iopk,iopl->iokl", weight, function, function)
     moment = np.einsum("iop,iopk,iopc->iokc", weight, function, value)
-    energy = (weight[..., None] * value**2).sum()
+    energy = (weight[..., None] * value**2).sum(axis=(1, 2, 3))
     fit = TensorFit(Normal(gram, moment, energy, at_i, at_o))
     u, v, w = (rng.normal(size=(n, 2)) for n in (4, 5, size))
 
@@ -126,7 +129,7 @@ def test_each_step_is_plain_least_squares(rng):
     loose = 1e-2  # a ridge of 1e-5 of the diagonal
     np.testing.assert_allclose(core, expected, rtol=0, atol=loose)
     left = (weight[..., None] * (value - model(u, v, w, core)) ** 2).sum()
-    assert abs(energy - gain.sum() - left) < loose * energy
+    assert abs(fit.energy - gain.sum() - left) < loose * fit.energy
 
     for mode, factor in enumerate((u, v, w)):
         wide = np.concatenate([factor, rng.normal(size=(len(factor), 1))], axis=1)
@@ -152,14 +155,17 @@ def test_each_step_is_plain_least_squares(rng):
 def test_a_promise_that_settling_would_break_is_kept(rng):
     at_i, at_o, w = rng.normal(size=(5, 4)), rng.normal(size=(6, 4)), rng.normal(size=(5, 6, 3, 8))
     gram, moment = w @ np.swapaxes(w, 2, 3), w @ rng.normal(size=(5, 6, 8, 2))
-    fit = TensorFit(Normal(gram, moment, 1e3, at_i, at_o))
+    fit = TensorFit(Normal(gram, moment, np.full(5, 200.0), at_i, at_o))
     asked = []
 
     def is_enough(factors):
         asked.append(factors)
         return len(asked) == 1  # before settling, and not after
 
-    found = grow(fit, lambda a, b, q, c, core: 1, 1e6, is_enough, first_channels=2)
+    def alike(factors):
+        return np.ones(len(gram))
+
+    found = grow(fit, lambda a, b, q, c, core: 1, 1e6, is_enough, alike, first_channels=2)
     assert len(asked) == 3  # the last is pruned once more, and no longer enough
 
     def value(factors):
@@ -171,7 +177,7 @@ def test_a_promise_that_settling_would_break_is_kept(rng):
 def test_pruning_takes_the_cell_that_matters_least_and_solves_anew(rng):
     at_i, at_o, function = rng.normal(size=(5, 4)), rng.normal(size=(6, 4)), rng.normal(size=(5, 6, 7, 3))
     moment = np.swapaxes(function, 2, 3) @ rng.normal(size=(5, 6, 7, 2))
-    fit = TensorFit(Normal(np.swapaxes(function, 2, 3) @ function, moment, 1e3, at_i, at_o))
+    fit = TensorFit(Normal(np.swapaxes(function, 2, 3) @ function, moment, np.full(5, 200.0), at_i, at_o))
     u, v, w = (rng.normal(size=(n, 2)) for n in (4, 4, 3))
     whole = Factors(u, v, w, fit.solve_core(u, v, fit.project(w)).value)
     found = prune(fit, whole, whole.core.size - 1, lambda factors: False)
@@ -210,6 +216,28 @@ def test_a_result_that_holds_all_cells_of_the_core_is_read(amber, tmp_path):
         del file["compact/core"], file["compact/core_stored"]
         file["compact/core"] = found.core
     np.testing.assert_array_equal(store.load(path).compact.core, found.core)
+
+
+def test_a_result_without_the_last_direction_function_is_read(amber, tmp_path):
+    path, (gridded, _, found) = tmp_path / "r.h5", amber
+    store.save(path, store.RunResult(gridded=gridded, compact=found))
+    with h5py.File(path, "r+") as file:
+        group = file["compact"]
+        axis, factor = group["direction_function"][:-1], group["direction_factor"][:-1]
+        del group["direction_factor"], group["direction_function"], group.attrs["direction_functions"]
+        group["direction_function"], group["direction_factor"] = axis, factor
+    earlier = store.load(path).compact.direction_factor
+    np.testing.assert_array_equal(earlier[:-1], found.direction_factor[:-1])
+    np.testing.assert_array_equal(earlier[-1], 0.0)
+
+
+def test_the_worst_incident_angle_is_balanced_against_the_others(amber, monkeypatch):
+    gridded, field, _ = amber
+    options = RepresentOptions(method="lobe_tensor", target=TargetOptions(numbers=70))
+    balanced = eta(represent(field, options, gridded), gridded)
+    monkeypatch.setattr(tensor_growth, "BALANCE", (0.0, 0.0))
+    plain = eta(represent(field, options, gridded), gridded)
+    assert balanced.max() < plain.max() and np.ptp(balanced) < np.ptp(plain)
 
 
 def test_a_sharp_lobe_costs_few_numbers_at_the_nodes_and_between_them(amber):

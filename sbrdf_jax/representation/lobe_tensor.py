@@ -29,6 +29,8 @@ from sbrdf_jax.splines import spline_weights
 MOST_FUNCTIONS = 13  # of one polar angle; the factors are smooth, however fine the grid
 ASYMMETRIC = 0.01  # relative size of the part odd in phi_o from which a user is told that it is dropped
 USELESS = 0.5  # error at the worst incident angle from which a user is told that a size was too small
+BALANCED = (0.4, 3.0)  # an incident angle's error over that of all: no more than so much is made of it
+NO_ERROR = 1e-12  # relative; below it is rounding
 MOST_BETWEEN = 5.0  # times a target's error may be that between the nodes, of a field that is known there
 
 
@@ -99,7 +101,7 @@ def represent(
         ends = theta_i[[0, -1]]
     num_rows = len(np.unique(np.concatenate([block.theta_i for block in half.blocks]))) if half.blocks else len(theta_i)
     num_i = min(num_rows, MOST_FUNCTIONS) if field.interpolate_theta_i else len(theta_i)
-    functions = num_i, min(len(theta_o), MOST_FUNCTIONS), num_direction_functions(floor)
+    functions = num_i, min(len(theta_o), MOST_FUNCTIONS), num_direction_functions(floor, is_field=half.is_field)
     num_wavelengths = np.size(field.basis.wavelength_nm)
     layout = Layout(len(theta_i), functions, num_wavelengths, field.basis.kind == "data")
     target = make_target(options.target, len(theta_i), num_wavelengths, budget)
@@ -149,22 +151,22 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
 
     size, count = layout.functions[2], len(vectors)
     gram, moment = np.zeros((len(rows), len(columns), size, size)), np.zeros((len(rows), len(columns), size, count))
-    total = 0.0
+    total = np.zeros(len(rows))
     for block in half.blocks:
         o = np.searchsorted(columns, block.theta_o)
         for i, angle in enumerate(block.theta_i):
             row = np.searchsorted(rows, angle)
-            function = _functions(angle, block.theta_o, block.phi_o, floor)
+            function = _functions(angle, block.theta_o, block.phi_o, floor, size)
             weight = (block.weight[i] / scale[row] ** 2)[..., None]
             weighted = np.swapaxes(function * weight, 1, 2)
             value = scale[row] * (block.brdf[i] @ vectors.T)
             gram[row, o] += weighted @ function
             moment[row, o] += weighted @ value
-            total += float((weight * value**2).sum())
+            total[row] += (weight * value**2).sum()
     fit = TensorFit(Normal(gram, moment, total, at_rows, at_columns))
 
     nodes, counts = half.nodes, half.known[place]
-    seen = [_Seen.of(block, rows, columns, floor) for block in half.blocks[: 2 if half.is_field else 1]]
+    seen = [_Seen.of(block, rows, columns, floor, size) for block in half.blocks[: 2 if half.is_field else 1]]
     if "delta_e" in (target.kind, *(stop.kind for stop in target.stops)) and matching is None:
         matching = colour.colour_matching(np.asarray(field.basis.wavelength_nm))
 
@@ -191,11 +193,18 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
         errors = node_errors(np.where(mask, value(part, factors), 0.0), np.where(mask, block.brdf, 0.0), part.twins)
         return bool(errors[counts].max(initial=0.0) <= allowed)
 
+    def errors(factors: Factors) -> np.ndarray:
+        mask = nodes.needed[..., None]
+        found, wanted = (np.where(mask, brdf, 0.0) for brdf in (value(seen[0], factors), nodes.brdf))
+        eta = node_errors(found, wanted, seen[0].twins)[counts]
+        share = eta / max(np.sqrt(np.mean(eta**2)), NO_ERROR)
+        return np.interp(rows, nodes.theta_i[counts], np.clip(share, *BALANCED))
+
     first = min(2, count) if layout.stores_vectors else count
     # what whole hemispheres may cost is too much for a part of them, but for the spectra that all share
     spectra = vectors.size if layout.stores_vectors else 0
     most = min(target.budget, spectra + np.mean(nodes.needed) * target.budget)
-    factors = grow(fit, layout.numbers, most, is_enough, first_channels=first)
+    factors = grow(fit, layout.numbers, most, is_enough, errors, first_channels=first)
     achieved, used = measure(target, factors), factors.core.shape[3]
     worst = measure(target._replace(kind="error"), factors) if target.is_size else achieved
     basis = vector_basis(field.basis.wavelength_nm, vectors[:used]) if layout.stores_vectors else field.basis
@@ -211,18 +220,18 @@ class _Seen(NamedTuple):
     twins: Float[np.ndarray, " p"]  # how many directions of the circle each azimuth stands for
 
     @classmethod
-    def of(cls, block: Block, rows: np.ndarray, columns: np.ndarray, floor: float) -> "_Seen":
+    def of(cls, block: Block, rows: np.ndarray, columns: np.ndarray, floor: float, count: int) -> "_Seen":
         """See a block among the rows and columns of a fit."""
-        function = [_functions(angle, block.theta_o, block.phi_o, floor) for angle in block.theta_i]
+        function = [_functions(angle, block.theta_o, block.phi_o, floor, count) for angle in block.theta_i]
         twins = np.where(np.isclose(block.phi_o, np.pi), 1.0, 2.0)
         places = (np.searchsorted(axis, own) for axis, own in ((rows, block.theta_i), (columns, block.theta_o)))
         return cls(*places, np.stack(function), twins)
 
 
-def _functions(theta_i, theta_o, phi_o, floor) -> Float[np.ndarray, "o p function"]:
+def _functions(theta_i, theta_o, phi_o, floor, count) -> Float[np.ndarray, "o p function"]:
     """Return the directional functions of one incident angle at every combination of two axes."""
     mesh = np.meshgrid(theta_o, phi_o, indexing="ij")
-    return direction_functions(np.full(mesh[0].shape, theta_i), *mesh, floor)
+    return direction_functions(np.full(mesh[0].shape, theta_i), *mesh, floor, count)
 
 
 def channels_of(basis: SpectralBasis, half: HalfField) -> tuple[np.ndarray, np.ndarray]:

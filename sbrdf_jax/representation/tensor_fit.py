@@ -40,7 +40,7 @@ class Normal(NamedTuple):
 
     gram: Float[np.ndarray, "i o direction_function direction_function"]
     moment: Float[np.ndarray, "i o direction_function channel"]
-    energy: float  # weighted sum of squares of the values
+    energy: Float[np.ndarray, " i"]  # weighted sum of squares of the values
     theta_i: Float[np.ndarray, "i theta_i_function"]  # the functions of theta_i at its rows
     theta_o: Float[np.ndarray, "o theta_o_function"]
 
@@ -77,6 +77,7 @@ class TensorFit:
 
     def __init__(self, normal: Normal):
         self.normal = normal
+        self.energy = float(normal.energy.sum())
         total = normal.gram.sum(axis=(0, 1))
         size = len(total)
         shift = RIDGE * np.trace(total) / size * np.eye(size)
@@ -85,6 +86,11 @@ class TensorFit:
             np.linalg.qr(normal.theta_o)[1],
             np.linalg.cholesky(total + shift).T,
         )
+
+    def weighted(self, weight: Float[np.ndarray, " i"]) -> "TensorFit":
+        """Return the problem in which squared errors at each row of theta_i count `weight` times as much."""
+        gram, moment = (array * weight[:, None, None, None] for array in self.normal[:2])
+        return TensorFit(self.normal._replace(gram=gram, moment=moment, energy=weight * self.normal.energy))
 
     def orthonormal(self, mode: int, factor):
         """Make the columns of a factor orthonormal over the rows of its mode, as far as they are independent.

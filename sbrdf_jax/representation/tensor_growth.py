@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from sbrdf_jax.representation.tensor_fit import Factors, SolvedCore, TensorFit
 from sbrdf_jax.representation.tensor_pruning import num_words, prune
@@ -15,7 +16,8 @@ KEPT = 0.5  # of the core's cells, as growth counts them: what pruning takes awa
 MOST_CELLS = 1800  # of the core for one channel; its normal equations have so many unknowns
 ALIKE = 0.8  # of the best step's score: such steps are taken with it
 LEAST_GAIN = 2e-3  # of the squared error; a step that gains less is noise, and growth ends
-MOST_SWEEPS, SWEEP_GAIN = 30, 0.1  # before and after the growth; of the squared error
+MOST_SWEEPS, SWEEP_GAIN = 30, 0.02  # before and after the growth; of the squared error
+BALANCE = (2.0, 1.0)  # powers of the errors, one after the other, by which each incident angle counts in the end
 NO_ERROR = 1e-24  # squared, relative; below it is rounding
 
 
@@ -24,6 +26,7 @@ def grow(
     numbers: Callable[[int, int, int, int, int], int],
     budget: float,
     is_enough: Callable[[Factors], bool],
+    errors: Callable[[Factors], Float[np.ndarray, " i"]],
     *,
     first_channels: int,
 ) -> Factors:
@@ -34,9 +37,10 @@ def grow(
         numbers: Stored numbers by the ranks a, b, q, the number of channels and that of the core's numbers.
         budget: Most numbers.
         is_enough: Asked after each step; the first that is enough is polished and pruned as far as it stays so.
+        errors: Asked in the end, to balance incident angles: the error at each row of theta_i, relative to that of all.
         first_channels: Channels to start with.
     """
-    energy = fit.normal.energy
+    energy = fit.energy
     factors, channels = _settle(fit, fit.start(), first_channels), first_channels
 
     def expected(factors, channels: int) -> int:
@@ -75,10 +79,14 @@ def grow(
                 factors, channels = trial
         is_same = all(one is other for one, other in zip(before, factors, strict=True))  # a channel more, no column
         factors, _ = fit.sweep(factors, channels, solved if is_same else None)
-    factors = _settle(fit, factors, channels, solved)
-    settled = Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2])).value[..., :channels])
+    settled, grown, weight = found, fit, 1.0
+    for power in BALANCE:
+        weight = weight * errors(settled) ** power
+        fit = grown.weighted(weight)
+        factors = _settle(fit, factors, channels)
+        settled = Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2])).value[..., :channels])
     if enough and not is_enough(settled):
-        settled = found  # settled for all, not for the worst
+        fit, settled = grown, found  # settled for all, not for the worst
     cells = np.size(settled.core)
     most = min(cells, budget - numbers(*settled.ranks, channels, num_words(cells)))
     return prune(fit, settled, max(int(most), 1), is_enough if enough else None)
@@ -110,7 +118,7 @@ def _settle(fit: TensorFit, factors, channels: int, solved: SolvedCore | None = 
     for _ in range(MOST_SWEEPS):
         factors, gained = fit.sweep(factors, channels, solved)
         solved = None
-        error = fit.normal.energy - gained
+        error = fit.energy - gained
         if before - error <= SWEEP_GAIN * error:
             break
         before = error

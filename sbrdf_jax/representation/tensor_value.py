@@ -49,7 +49,8 @@ def tensor_value(
     along_i = theta_i_functions(tensor, theta_i)
     at_i = along_i @ tensor.theta_i_factor
     at_o = spline_weights(theta_o * (2 / np.pi), tensor.theta_o_factor.shape[0]) @ tensor.theta_o_factor
-    at_direction = direction_functions(theta_i, theta_o, phi_o, tensor.half_angle_floor) @ tensor.direction_factor
+    factor = tensor.direction_factor
+    at_direction = direction_functions(theta_i, theta_o, phi_o, tensor.half_angle_floor, factor.shape[0]) @ factor
     _, rank_o, rank_direction, _ = tensor.core.shape
     amplitude = xp.tensordot(at_i, tensor.core, 1).reshape(*np.shape(theta_i), rank_o, -1)
     amplitude = (at_o[..., None, :] @ amplitude).reshape(*polar, rank_direction, -1)
