@@ -278,6 +278,20 @@ def test_promises_that_rounding_breaks_are_stored_wider(forms):
     assert found.compact.storage == "float32"
 
 
+def test_rounding_that_would_be_the_worst_error_is_stored_wider(forms):
+    form, gridded = forms["lobe_harmonics"]  # with two lobes of opposite signs that all but cancel
+    kind, width, peak = (
+        np.repeat(array[:, :1], 2, axis=1) for array in (form.lobe_kind, form.lobe_width, THETA[:, None])
+    )
+    height = np.stack([form.lobe_height[:, 0] + 1e5, np.full_like(form.lobe_height[:, 0], -1e5)], axis=1)
+    form = dataclasses.replace(form, lobe_kind=kind, lobe_width=width, lobe_peak_theta_o=peak, lobe_height=height)
+    gridded = grid_of(evaluate_in_chunks(form, *MESH))
+    assert eta(round_form(form, "float16"), gridded).max() > 10 * storage_choice.TOLERATED
+    found = storage_choice.store(form, "float16", field_of(gridded), gridded, (), None)
+    assert found.compact.storage == "float32" and "add more than the error is" in found.warnings[0]
+    assert eta(found.compact, gridded).max() < storage_choice.TOLERATED
+
+
 @pytest.mark.parametrize("target", [{"error": 0.03}, {"delta_e": 2.0}], ids=str)
 @pytest.mark.parametrize("storage", ["float16", "quantised"])
 def test_targets_are_met_as_stored(forms, target, storage):

@@ -19,6 +19,7 @@ from sbrdf_jax.representation.target import Target, is_met
 
 ROUNDING_SHARE = 0.1  # of the form's own error may "quantised" add, at every incident angle with data
 LEAST_SHARE = 0.01  # of its worst, where it is more exact than that
+TOLERATED = 0.01  # eta that rounding to a float of any width may add, or the form's own worst
 EVALUATION = 1e-9  # relative; what an error differs by from how the fit saw it
 FIRST_BITS, MOST_BITS = 8, 24  # float32 has as many
 WIDER = {"quantised": ("float32", "float64"), "float16": ("float32", "float64"), "float32": ("float64",)}
@@ -61,7 +62,7 @@ def store(
         compact: The form, unrounded.
         storage: "float32", "float16" or "quantised"; the last with the fewest bits by which rounding
             adds no more than `ROUNDING_SHARE` of the form's own error at any incident angle with data, or than
-            `LEAST_SHARE` of its worst.
+            `LEAST_SHARE` of its worst. The others may add as much as the form's own worst error, or `TOLERATED`.
         field: What the form is of.
         gridded: The grid stage, if there is one; else the field's own spectra are compared.
         promises: Of errors; those that the unrounded form keeps, the rounded one keeps too.
@@ -82,10 +83,11 @@ def store(
     known = has_data(grid) & np.isfinite(before.error)
     kept = [promise for promise in promises if before.worst(promise.kind, known) <= promise.value * (1 + EVALUATION)]
     limit = _limit_between(exact, kept, gridded, known)
-    allowed = np.maximum(ROUNDING_SHARE * before.error, LEAST_SHARE * np.max(before.error[known], initial=0.0))
+    worst = np.max(before.error[known], initial=0.0)
+    allowed = np.maximum(ROUNDING_SHARE * before.error, LEAST_SHARE * worst)
 
     def is_enough(form: Form, found: _Measured) -> bool:
-        most = allowed if form.storage == "quantised" else np.inf
+        most = allowed if form.storage == "quantised" else max(worst, TOLERATED)
         small = (found.storage_error <= most)[known].all() and np.isfinite(found.storage_error[known]).all()
         holds = all(is_met(promise, found.worst(promise.kind, known)) for promise in kept)
         return bool(small and holds and (limit == np.inf or _worst_between(form, gridded, known) <= limit))
@@ -97,7 +99,7 @@ def store(
             break
     warnings = ()
     if form.storage != storage:
-        why = "its rounding would break a promise, or takes more digits than that for so small an error"
+        why = "its rounding would break a promise, or add more than the error is"
         warnings = (f"compact: stored as {form.storage}, not as {storage}: {why}",)
     achieved = {promise.kind: found.worst(promise.kind, known) for promise in promises}
     return Stored(form, found.storage_error, achieved, warnings)
