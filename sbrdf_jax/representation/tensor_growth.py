@@ -9,14 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sbrdf_jax.representation.tensor_fit import Factors, SolvedCore, TensorFit
+from sbrdf_jax.representation.tensor_fit import Factors, TensorFit
 from sbrdf_jax.representation.tensor_pruning import num_words, prune
 
 KEPT = 0.5  # of the core's cells, as growth counts them: what pruning takes away costs hardly any error
 MOST_CELLS = 1800  # of the core for one channel; its normal equations have so many unknowns
 ALIKE = 0.8  # of the best step's score: such steps are taken with it
 LEAST_GAIN = 2e-3  # of the squared error; a step that gains less is noise, and growth ends
-MOST_SWEEPS, SWEEP_GAIN = 30, 0.02  # before and after the growth; of the squared error
+MOST_SWEEPS = 30  # before and after the growth
+START_GAIN, END_GAIN = 0.02, 0.1  # of the squared error: sweeps that gain less are the last
 BALANCE = (1.0, 1.0, 0.5)  # powers of the errors, one after the other, by which each incident angle counts in the end
 NO_ERROR = 1e-24  # squared, relative; below it is rounding
 
@@ -41,7 +42,7 @@ def grow(
         first_channels: Channels to start with.
     """
     energy = fit.energy
-    factors, channels = _settle(fit, fit.start(), first_channels), first_channels
+    factors, channels = _settle(fit, fit.start(), first_channels, START_GAIN), first_channels
 
     def expected(factors, channels: int) -> int:
         ranks = [f.shape[1] for f in factors]
@@ -83,7 +84,7 @@ def grow(
     for power in BALANCE:
         weight = weight * errors(settled) ** power
         fit = grown.weighted(weight)
-        factors = _settle(fit, factors, channels)
+        factors = _settle(fit, factors, channels, END_GAIN)
         settled = Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2])).value[..., :channels])
     if enough and not is_enough(settled):
         fit, settled = grown, found  # settled for all, not for the worst
@@ -112,14 +113,13 @@ def _steps(fit: TensorFit, found: Factors, most_channels: int) -> list[_Step]:
     return steps if found.core.shape[3] == most_channels else [*steps, _Step()]
 
 
-def _settle(fit: TensorFit, factors, channels: int, solved: SolvedCore | None = None) -> list[np.ndarray]:
-    """Sweep until the error hardly falls any more; `solved` is the core of the factors, if it is known."""
+def _settle(fit: TensorFit, factors, channels: int, least_gain: float) -> list[np.ndarray]:
+    """Sweep until the error hardly falls any more."""
     before = np.inf
     for _ in range(MOST_SWEEPS):
-        factors, gained = fit.sweep(factors, channels, solved)
-        solved = None
+        factors, gained = fit.sweep(factors, channels)
         error = fit.energy - gained
-        if before - error <= SWEEP_GAIN * error:
+        if before - error <= least_gain * error:
             break
         before = error
     return factors
