@@ -243,8 +243,8 @@ def leave_out(gridded, field, known) -> None:
         gridded, theta_i=theta_i[kept], brdf=brdf[kept], extrapolated=np.asarray(gridded.extrapolated)[kept], field=None
     )
     spectra = dataclasses.replace(field, theta_i=theta_i[kept], coefficient=np.asarray(field.coefficient)[kept])
-    options = RepresentOptions(method="lobe_tensor", target=TargetOptions(numbers=214))
-    compact = represent(spectra, options, part)
+    size = 214 * len(theta_i) / len(kept)  # in all, what 214 numbers are for each angle of the whole grid
+    compact = represent(spectra, RepresentOptions("lobe_tensor", TargetOptions(numbers=size)), part)
     logarithm = np.log(np.maximum(brdf[kept], 1e-9))
     found = {
         "lobe_tensor": np.stack([on_axes(compact, t, gridded.theta_o, gridded.phi_o) for t in theta_i[left]]),

@@ -233,7 +233,7 @@ def test_a_result_without_the_last_direction_function_is_read(amber, tmp_path):
 
 def test_the_worst_incident_angle_is_balanced_against_the_others(amber, monkeypatch):
     gridded, field, _ = amber
-    options = RepresentOptions(method="lobe_tensor", target=TargetOptions(numbers=70))
+    options = RepresentOptions(method="lobe_tensor", target=TargetOptions(numbers=60))
     balanced = eta(represent(field, options, gridded), gridded)
     monkeypatch.setattr(tensor_growth, "BALANCE", (0.0,))
     plain = eta(represent(field, options, gridded), gridded)

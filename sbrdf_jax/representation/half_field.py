@@ -24,6 +24,7 @@ MIDWAY_WEIGHT = 0.1  # where it is interpolated between incident angles so far a
 WIDE_GAP = np.radians(15.0)  # so far; below it splines are better by the fourth power of the gap, and this counts less
 RELATIVE_SHARE = 0.03  # of the error relative to each direction's own energy
 RELATIVE_FLOOR = 1e-3  # of the mean energy of a direction
+EARLIER = 0.2  # of what a row adds midway may the next one add, though it happens to add less
 SMOOTH = 1e-3  # of a logarithm: what is as even as that is even
 SMALLEST = 1e-9  # of the largest value; logarithms of less are not taken
 
@@ -196,12 +197,13 @@ def _interpolate_logarithm(nodes: Block, theta_o, phi_o):
 def _between_incident_angles(
     nodes: Block, usable: Bool[np.ndarray, " i"], phi_o: Float[np.ndarray, " p"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return theta_o, phi_o and values midway between incident angles, by polynomials through up to six logarithms.
+    """Return theta_o, phi_o and values midway between incident angles.
 
-    On one path theta_o stays, as does what is broad; on the other it moves with theta_i, so that a peak that moves
-    with its mirror direction stays one peak. Of the two, the one that is smoother around a direction counts most.
+    On one path theta_o stays, as does what is broad: a cubic spline through logarithms. On the other it moves with
+    theta_i, so that a peak that moves with its mirror direction stays one peak: polynomials through up to six
+    logarithms. Of the two, the one that is smoother around a direction counts most.
     """
-    from scipy.interpolate import PchipInterpolator
+    from scipy.interpolate import CubicSpline, PchipInterpolator
     from scipy.ndimage import maximum_filter1d
 
     step = np.diff(nodes.theta_i).mean()
@@ -215,6 +217,8 @@ def _between_incident_angles(
     along = PchipInterpolator(nodes.theta_o, logarithm, axis=1)
     above = np.arange(len(nodes.theta_i) - 1) + len(logarithm) - len(nodes.theta_i) + 1  # places of the next ones
     stay, rough = _along_path(along, usable, above, theta_o, 0.0, nodes.theta_o[-1])
+    if usable.sum() > 1:
+        stay = CubicSpline(np.flatnonzero(usable), along(theta_o)[usable])(above - 0.5)
     move, uneven = _along_path(along, usable, above, theta_o, step, GRAZING)
     size = 1 + 2 * round(step / np.diff(nodes.theta_o).mean())
     rough, uneven = (maximum_filter1d(np.nan_to_num(error), size, axis=1) + SMOOTH for error in (rough, uneven))
@@ -224,7 +228,8 @@ def _between_incident_angles(
 
 
 def _along_path(along, usable, above, theta_o, step: float, last: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return values midway between rows and how far they may be off: what the last of six rows adds; nan where none is.
+    """Return values midway between rows and how far they may be off: what the last of six rows adds, or a share of
+    what the rows before it added; nan where none is.
 
     Args:
         along: Rows by theta_o.
@@ -248,7 +253,7 @@ def _along_path(along, usable, above, theta_o, step: float, last: float) -> tupl
     for first, end in ((2, 5), (1, 4), (1, 5), (0, 4), (2, 6), (0, 5), (1, 6), (0, 6)):  # the last that exist are best
         more = exists[first:end].all(axis=0)
         better = np.tensordot(_midway_weights(first, end), filled[first:end], 1)
-        error = np.where(more, np.abs(better - value), error)
+        error = np.where(more, np.maximum(np.abs(better - value), EARLIER * error), error)
         value = np.where(more, better, value)
     return value, error.mean(axis=-1, keepdims=True)
 

@@ -29,7 +29,7 @@ from sbrdf_jax.splines import spline_weights
 MOST_FUNCTIONS = 13  # of one polar angle; the factors are smooth, however fine the grid
 ASYMMETRIC = 0.01  # relative size of the part odd in phi_o from which a user is told that it is dropped
 USELESS = 0.5  # error at the worst incident angle from which a user is told that a size was too small
-BALANCED = (0.4, 3.0)  # an incident angle's error over that of all: no more than so much is made of it
+BALANCED = (0.7, 3.0)  # an incident angle's error over that of all: no more than so much is made of it
 NO_ERROR = 1e-12  # relative; below it is rounding
 MOST_BETWEEN = 5.0  # times a target's error may be that between the nodes, of a field that is known there
 
