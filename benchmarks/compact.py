@@ -115,10 +115,11 @@ def records(
         )
 
     for size in sizes:
-        options = RepresentOptions(method="lobe_tensor", target=TargetOptions(numbers=size))
-        compact, timing = timed(lambda options=options: represent(field, options, gridded), repeats)
-        found = evaluate_on_axes(compact, *axes)
-        yield record("lobe_tensor", f"{size} numbers", stored_numbers(compact), found, timing)
+        for method in [form for form, (allowed, _) in FORMS.items() if size in allowed]:
+            options = RepresentOptions(method, TargetOptions(numbers=size))
+            compact, timing = timed(lambda options=options: represent(field, options, gridded), repeats)
+            found = evaluate_on_axes(compact, *axes)
+            yield record(method, f"{size} numbers", stored_numbers(compact), found, timing)
         for method, baseline in BASELINES.items():
             (numbers, found), timing = timed(lambda b=baseline, size=size: b(brdf, known, size * per_angle), 0)
             if found is not None:
