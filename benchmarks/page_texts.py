@@ -10,10 +10,10 @@ SECTIONS = {
         "Solvers of the bounded least squares problem",
         """\
 Method `paper`'s problem, by the own solver (with the geometry's inverse, whose set-up is apart, and from
-nothing, in float64 and float32) and by other packages, over tolerances or numbers of steps. The relative KKT
-residual is taken in float64 of what was returned. The error against the truth stays at that of the grid once
-a solver has converged; `distance` is that from the own answer at a tolerance of 1e-10. Method `guided`
-refuses float32, so it has no such rows.""",
+nothing: in float64, "mixed", which begins in float32 and ends in float64, and in float32 alone, which reaches
+1e-4 at most) and by other packages, over tolerances or numbers of steps. The relative KKT residual is taken in
+float64 of what was returned. The error against the truth stays at that of the grid once a solver has converged;
+`distance` is that from the own answer at a tolerance of 1e-10. In float32 alone method `guided` is refused.""",
     ),
     "interpolation": (
         "Held-out samples",
