@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sbrdf_jax.representation.tensor_fit import Factors, TensorFit
+from sbrdf_jax.representation.tensor_fit import Factors, SolvedCore, TensorFit
 from sbrdf_jax.representation.tensor_pruning import num_words, prune
 
 KEPT = 0.5  # of the core's cells, as growth counts them: what pruning takes away costs hardly any error
-MOST_CELLS = 1800  # of the core for one channel; its normal equations have so many unknowns
+MOST_CELLS = 1500  # of the core for one channel; its normal equations have so many unknowns
 ALIKE = 0.8  # of the best step's score: such steps are taken with it
 LEAST_GAIN = 2e-3  # of the squared error; a step that gains less is noise, and growth ends
 MOST_SWEEPS = 30  # before and after the growth
@@ -42,7 +42,8 @@ def grow(
         first_channels: Channels to start with.
     """
     energy = fit.energy
-    factors, channels = _settle(fit, fit.start(), first_channels, START_GAIN), first_channels
+    channels = first_channels
+    factors, solved = _settle(fit, fit.start(), channels, START_GAIN)
 
     def expected(factors, channels: int) -> int:
         ranks = [f.shape[1] for f in factors]
@@ -53,7 +54,6 @@ def grow(
         return bool(np.prod([f.shape[1] for f in factors]) <= MOST_CELLS and expected(factors, channels) <= budget)
 
     while True:
-        solved = fit.solve_core(*factors[:2], fit.project(factors[2]))
         error = energy - solved.gain[:channels].sum()
         found = Factors(*factors, solved.value[..., :channels])
         enough = is_enough(found)
@@ -80,12 +80,13 @@ def grow(
                 factors, channels = trial
         is_same = all(one is other for one, other in zip(before, factors, strict=True))  # a channel more, no column
         factors, _ = fit.sweep(factors, channels, solved if is_same else None)
+        solved = _core(fit, factors)
     settled, grown, weight = found, fit, 1.0
     for power in BALANCE:
         weight = weight * errors(settled) ** power
         fit = grown.weighted(weight)
-        factors = _settle(fit, factors, channels, END_GAIN)
-        settled = Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2])).value[..., :channels])
+        factors, solved = _settle(fit, factors, channels, END_GAIN)
+        settled = Factors(*factors, solved.value[..., :channels])
     if enough and not is_enough(settled):
         fit, settled = grown, found  # settled for all, not for the worst
     cells = np.size(settled.core)
@@ -113,16 +114,22 @@ def _steps(fit: TensorFit, found: Factors, most_channels: int) -> list[_Step]:
     return steps if found.core.shape[3] == most_channels else [*steps, _Step()]
 
 
-def _settle(fit: TensorFit, factors, channels: int, least_gain: float) -> list[np.ndarray]:
-    """Sweep until the error hardly falls any more."""
-    before = np.inf
+def _settle(fit: TensorFit, factors, channels: int, least_gain: float) -> tuple[list[np.ndarray], SolvedCore]:
+    """Sweep until the error hardly falls any more; return the factors and their core."""
+    solved = _core(fit, factors)
+    error = fit.energy - solved.gain[:channels].sum()
     for _ in range(MOST_SWEEPS):
-        factors, gained = fit.sweep(factors, channels)
-        error = fit.energy - gained
+        before = error
+        factors, _ = fit.sweep(factors, channels, solved)
+        solved = _core(fit, factors)
+        error = fit.energy - solved.gain[:channels].sum()
         if before - error <= least_gain * error:
             break
-        before = error
-    return factors
+    return factors, solved
+
+
+def _core(fit: TensorFit, factors) -> SolvedCore:
+    return fit.solve_core(*factors[:2], fit.project(factors[2]))
 
 
 def _score(error: float, gained: float, cost: int) -> float:
