@@ -120,7 +120,9 @@ def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("devices")
     raw = measure("amber_glass", count=40)
     wavelengths = np.linspace(0, len(raw.wavelength_nm) - 1, 6).round().astype(int)  # four devices do not divide 6
-    part = {"wavelength_nm": raw.wavelength_nm[wavelengths], "value": raw.value[:, wavelengths]}
+    value = raw.value[:, wavelengths]
+    value[::3] = 0.0  # dark directions between bright ones: the bounds bind, and guided needs its solver
+    part = {"wavelength_nm": raw.wavelength_nm[wavelengths], "value": value}
     write_samples(folder / "amber.h5", raw.__class__(**{**vars(raw), **part}))
     (folder / "config.yaml").write_text(CONFIG)
     four = start_on_four(PIPELINE, *METHODS, cwd=folder)
@@ -158,8 +160,7 @@ def test_the_lanes_of_a_run_lie_on_four_devices(results, method):
     arrays = [array for of, *array in seen if of == method]
     assert_spread(arrays)
     solves = [shards[0] for shape, _, shards in arrays if len(shape) == 2 and shape[1] == 8]  # 6, filled up
-    assert all(shard[1] == 2 for shard in solves)
-    assert bool(solves) == (method == "paper")  # where no bound binds, guided solves without a device
+    assert solves and all(shard[1] == 2 for shard in solves)
     assert any(shape[0] == 16 and shards[0][0] == 4 for shape, _, shards in arrays)  # pairs of the lobe search
 
 

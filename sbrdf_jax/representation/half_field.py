@@ -216,9 +216,8 @@ def _between_incident_angles(
         usable = np.concatenate([usable[2:0:-1], usable])
     along = PchipInterpolator(nodes.theta_o, logarithm, axis=1)
     above = np.arange(len(nodes.theta_i) - 1) + len(logarithm) - len(nodes.theta_i) + 1  # places of the next ones
-    stay, rough = _along_path(along, usable, above, theta_o, 0.0, nodes.theta_o[-1])
-    if usable.sum() > 1:
-        stay = CubicSpline(np.flatnonzero(usable), along(theta_o)[usable])(above - 0.5)
+    stay = CubicSpline(np.flatnonzero(usable), along(theta_o)[usable])(above - 0.5)  # the first and the last are usable
+    _, rough = _along_path(along, usable, above, theta_o, 0.0, nodes.theta_o[-1])
     move, uneven = _along_path(along, usable, above, theta_o, step, GRAZING)
     size = 1 + 2 * round(step / np.diff(nodes.theta_o).mean())
     rough, uneven = (maximum_filter1d(np.nan_to_num(error), size, axis=1) + SMOOTH for error in (rough, uneven))

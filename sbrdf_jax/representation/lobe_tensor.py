@@ -22,15 +22,14 @@ from sbrdf_jax.representation.direction_functions import (
 from sbrdf_jax.representation.half_field import Block, HalfField, half_field
 from sbrdf_jax.representation.target import Target, in_words, is_met, make_target, measured, node_errors
 from sbrdf_jax.representation.tensor_fit import Factors, Normal, TensorFit
-from sbrdf_jax.representation.tensor_growth import grow
+from sbrdf_jax.representation.tensor_growth import NO_ERROR, grow
 from sbrdf_jax.representation.tensor_pruning import stored_cells
 from sbrdf_jax.splines import spline_weights
 
 MOST_FUNCTIONS = 13  # of one polar angle; the factors are smooth, however fine the grid
 ASYMMETRIC = 0.01  # relative size of the part odd in phi_o from which a user is told that it is dropped
 USELESS = 0.5  # error at the worst incident angle from which a user is told that a size was too small
-BALANCED = (0.7, 3.0)  # an incident angle's error over that of all: no more than so much is made of it
-NO_ERROR = 1e-12  # relative; below it is rounding
+SHARES = (0.7, 3.0)  # least and most that the balance takes an incident angle's error for, over that of all
 MOST_BETWEEN = 5.0  # times a target's error may be that between the nodes, of a field that is known there
 
 
@@ -175,6 +174,13 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
         value = ((part.function @ factors.direction) @ amplitude) @ vectors[: factors.core.shape[3]]
         return np.maximum(value / scale[part.rows][:, None, None, None], 0.0)
 
+    def eta(number: int, factors: Factors) -> np.ndarray:
+        """Errors of the needed directions of a block, at each incident angle that counts."""
+        part, block = seen[number], half.blocks[number]
+        mask = block.needed[..., None]
+        found, wanted = (np.where(mask, brdf, 0.0) for brdf in (value(part, factors), block.brdf))
+        return node_errors(found, wanted, part.twins)[counts]
+
     def measure(target: Target, factors: Factors) -> float:
         stored = layout.numbers(*factors.ranks, factors.core.shape[3], stored_cells(factors.core))
         if target.is_size:
@@ -188,17 +194,12 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
         allowed = MOST_BETWEEN * min((stop.value for stop in target.stops if stop.kind == "error"), default=np.inf)
         if allowed >= 1 or not half.is_field:
             return True
-        part, block = seen[1], half.blocks[1]
-        mask = block.needed[..., None]
-        errors = node_errors(np.where(mask, value(part, factors), 0.0), np.where(mask, block.brdf, 0.0), part.twins)
-        return bool(errors[counts].max(initial=0.0) <= allowed)
+        return bool(eta(1, factors).max(initial=0.0) <= allowed)
 
     def errors(factors: Factors) -> np.ndarray:
-        mask = nodes.needed[..., None]
-        found, wanted = (np.where(mask, brdf, 0.0) for brdf in (value(seen[0], factors), nodes.brdf))
-        eta = node_errors(found, wanted, seen[0].twins)[counts]
-        share = eta / max(np.sqrt(np.mean(eta**2)), NO_ERROR)
-        return np.interp(rows, nodes.theta_i[counts], np.clip(share, *BALANCED))
+        at_nodes = eta(0, factors)
+        share = at_nodes / np.sqrt(max(np.mean(at_nodes**2), NO_ERROR))
+        return np.interp(rows, nodes.theta_i[counts], np.clip(share, *SHARES))
 
     first = min(2, count) if layout.stores_vectors else count
     # what whole hemispheres may cost is too much for a part of them, but for the spectra that all share

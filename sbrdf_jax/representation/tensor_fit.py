@@ -163,16 +163,14 @@ class TensorFit:
         both = (known * (solved.right + RIDGE * known)).sum(axis=0)
         return both + (added * (right + diagonal[:, None] * added)).sum(axis=0) - solved.gain
 
-    def sweep(self, factors, channels: int, solved: SolvedCore | None = None) -> tuple[list[np.ndarray], float]:
-        """Renew the core and each factor once, by the first `channels` alone; `solved` is the core, if it is known.
+    def error(self, solved: SolvedCore, channels: int) -> float:
+        """Return the squared error that a core leaves, of its first `channels`."""
+        return float(self.energy - solved.gain[:channels].sum())
 
-        Returns:
-            The factors, and by how much those that were given lower the error.
-        """
+    def sweep(self, factors, channels: int, solved: SolvedCore) -> list[np.ndarray]:
+        """Renew each factor once, by the first `channels` alone; `solved` is the core of those that are given."""
         u, v, w = factors
-        n = self.normal
-        solved = self.solve_core(u, v, self.project(w)) if solved is None else solved
-        projection = solved.projection
+        n, projection = self.normal, solved.projection
         core = solved.value[..., :channels]
         gram, moment = projection.gram, projection.moment[..., :channels]
         a, b, q, c = core.shape
@@ -192,7 +190,7 @@ class TensorFit:
         matrix = _unpair(n.gram.reshape(-1, size * size).T @ squares, size, q)
         right = np.tensordot(n.moment[..., :channels], part, ((0, 1, 3), (0, 1, 3)))
         w, _ = self.orthonormal(2, _solve(matrix, right.reshape(-1, 1))[0].reshape(size, q))
-        return [u, v, w], solved.gain[:channels].sum()
+        return [u, v, w]
 
     def amplitudes(self, u, v, core) -> Float[np.ndarray, "i o q channel"]:
         """Return what multiplies the directional factor at every pair of polar angles."""

@@ -41,7 +41,6 @@ def grow(
         errors: Asked in the end, to balance incident angles: the error at each row of theta_i, relative to that of all.
         first_channels: Channels to start with.
     """
-    energy = fit.energy
     channels = first_channels
     factors, solved = _settle(fit, fit.start(), channels, START_GAIN)
 
@@ -54,10 +53,10 @@ def grow(
         return bool(np.prod([f.shape[1] for f in factors]) <= MOST_CELLS and expected(factors, channels) <= budget)
 
     while True:
-        error = energy - solved.gain[:channels].sum()
+        error = fit.error(solved, channels)
         found = Factors(*factors, solved.value[..., :channels])
         enough = is_enough(found)
-        if error <= NO_ERROR * energy or enough:
+        if error <= NO_ERROR * fit.energy or enough:
             break
         held, steps = expected(factors, channels), []
         for step in _steps(fit, found, len(solved.gain)):
@@ -79,7 +78,7 @@ def grow(
             if score >= ALIKE * steps[0][0] and fits(*trial):
                 factors, channels = trial
         is_same = all(one is other for one, other in zip(before, factors, strict=True))  # a channel more, no column
-        factors, _ = fit.sweep(factors, channels, solved if is_same else None)
+        factors = fit.sweep(factors, channels, solved if is_same else _core(fit, factors))
         solved = _core(fit, factors)
     settled, grown, weight = found, fit, 1.0
     for power in BALANCE:
@@ -117,18 +116,19 @@ def _steps(fit: TensorFit, found: Factors, most_channels: int) -> list[_Step]:
 def _settle(fit: TensorFit, factors, channels: int, least_gain: float) -> tuple[list[np.ndarray], SolvedCore]:
     """Sweep until the error hardly falls any more; return the factors and their core."""
     solved = _core(fit, factors)
-    error = fit.energy - solved.gain[:channels].sum()
+    error = fit.error(solved, channels)
     for _ in range(MOST_SWEEPS):
         before = error
-        factors, _ = fit.sweep(factors, channels, solved)
+        factors = fit.sweep(factors, channels, solved)
         solved = _core(fit, factors)
-        error = fit.energy - solved.gain[:channels].sum()
+        error = fit.error(solved, channels)
         if before - error <= least_gain * error:
             break
     return factors, solved
 
 
 def _core(fit: TensorFit, factors) -> SolvedCore:
+    """Return the best core of three factors."""
     return fit.solve_core(*factors[:2], fit.project(factors[2]))
 
 
