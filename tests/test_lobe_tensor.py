@@ -134,11 +134,12 @@ def test_each_step_is_plain_least_squares(rng):
     for mode, factor in enumerate((u, v, w)):
         wide = np.concatenate([factor, rng.normal(size=(len(factor), 1))], axis=1)
         a, b, q = (wide if k == mode else f for k, f in enumerate((u, v, w)))
-        more = fit.solve_core(a, b, fit.project(q)).gain
-        np.testing.assert_allclose(fit.added_gain(solved, (u, v, w), mode, wide), more - gain, rtol=1e-8)
+        more, widened = fit.solve_core(a, b, fit.project(q)), fit.widened_core(solved, (u, v, w), mode, wide)
+        np.testing.assert_allclose(widened.gain, more.gain - gain, rtol=1e-8)
+        np.testing.assert_allclose(widened.value, more.value, rtol=1e-6, atol=1e-8)
 
     assert fit.energy - fit.error(solved, channels) == pytest.approx(gain.sum())
-    once = fit.sweep([u, v, w], channels, solved)
+    once = fit.sweep([u, v, w], solved.value, solved.projection)
     by_hand = [u, v, w]
     core = solved.value
     for mode in range(3):

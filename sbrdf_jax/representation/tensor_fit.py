@@ -51,6 +51,10 @@ class Projection(NamedTuple):
     gram: Float[np.ndarray, "i o q q"]
     moment: Float[np.ndarray, "i o q channel"]
 
+    def weighted(self, weight: Float[np.ndarray, " i"]) -> "Projection":
+        """Return the sums where squared errors at each row of theta_i count `weight` times as much."""
+        return Projection(*(array * weight[:, None, None, None] for array in self))
+
 
 class CoreProblem(NamedTuple):
     """Normal equations of a core, their diagonal scaled to 1 and the ridge on it."""
@@ -70,6 +74,13 @@ class SolvedCore(NamedTuple):
     root: Float[np.ndarray, "cell cell"]  # lower Cholesky factor of the scaled normal matrix
     scale: Float[np.ndarray, " cell"]
     right: Float[np.ndarray, "cell channel"]  # scaled right side
+
+
+class WidenedCore(NamedTuple):
+    """The best core for factors of which one has more columns."""
+
+    value: Float[np.ndarray, "a b q channel"]
+    gain: Float[np.ndarray, " channel"]  # by how much each channel lowers the error further
 
 
 class TensorFit:
@@ -131,8 +142,8 @@ class TensorFit:
         right = _core_right(at, projection.moment[..., : factors.core.shape[3]])
         return _scaled(_core_matrix(at, at, projection.gram), right)
 
-    def added_gain(self, solved: SolvedCore, factors, mode: int, wide) -> Float[np.ndarray, " channel"]:
-        """Return by how much each channel lowers the error further if one factor has more columns.
+    def widened_core(self, solved: SolvedCore, factors, mode: int, wide) -> WidenedCore:
+        """Return the best core if one factor has more columns, and by how much each channel lowers the error further.
 
         The unknowns that they bring are solved for by their Schur complement; what is factorised stays.
 
@@ -161,17 +172,20 @@ class TensorFit:
             solved.root, explained @ added, lower=True, trans="T", check_finite=False
         )
         both = (known * (solved.right + RIDGE * known)).sum(axis=0)
-        return both + (added * (right + diagonal[:, None] * added)).sum(axis=0) - solved.gain
+        gain = both + (added * (right + diagonal[:, None] * added)).sum(axis=0) - solved.gain
+        shape = list(solved.value.shape)
+        shape[mode] = column.shape[1]
+        parts = (known * solved.scale[:, None]).reshape(solved.value.shape), added.reshape(shape)
+        return WidenedCore(np.concatenate(parts, axis=mode), gain)
 
     def error(self, solved: SolvedCore, channels: int) -> float:
         """Return the squared error that a core leaves, of its first `channels`."""
         return float(self.energy - solved.gain[:channels].sum())
 
-    def sweep(self, factors, channels: int, solved: SolvedCore) -> list[np.ndarray]:
-        """Renew each factor once, by the first `channels` alone; `solved` is the core of those that are given."""
+    def sweep(self, factors, core, projection: Projection) -> list[np.ndarray]:
+        """Renew each factor once, by the channels that `core` has; `projection` is that of the direction's factor."""
         u, v, w = factors
-        n, projection = self.normal, solved.projection
-        core = solved.value[..., :channels]
+        n, channels = self.normal, core.shape[3]
         gram, moment = projection.gram, projection.moment[..., :channels]
         a, b, q, c = core.shape
         part = np.tensordot(n.theta_o @ v, core, (1, 1)).transpose(0, 2, 3, 1)  # [o, q, c, a]
@@ -218,8 +232,9 @@ class TensorFit:
                 continue
             scaled = scipy.linalg.solve_triangular(root, matrix, trans="T")
             leading = np.linalg.eigh(scaled @ scaled.T)[1][:, -more:]
-            columns = scipy.linalg.solve_triangular(root, leading)
-            found.append(self.orthonormal(mode, np.concatenate([factors[mode], columns], axis=1))[0])
+            turned = root @ factors[mode]  # orthonormal
+            columns = scipy.linalg.solve_triangular(root, leading - turned @ (turned.T @ leading))
+            found.append(np.concatenate([factors[mode], self.orthonormal(mode, columns)[0]], axis=1))
         return found
 
 

@@ -16,9 +16,9 @@ KEPT = 0.5  # of the core's cells, as growth counts them: what pruning takes awa
 MOST_CELLS = 1500  # of the core for one channel; its normal equations have so many unknowns
 ALIKE = 0.8  # of the best step's score: such steps are taken with it
 LEAST_GAIN = 2e-3  # of the squared error; a step that gains less is noise, and growth ends
-MOST_SWEEPS = 30  # before and after the growth
-START_GAIN, END_GAIN = 0.02, 0.1  # of the squared error: sweeps that gain less are the last
-BALANCE = (1.0, 1.0, 0.5)  # powers of the errors, one after the other, by which each incident angle counts in the end
+MOST_SWEEPS, START_GAIN = 30, 0.02  # before the growth; of the squared error: a sweep that gains less is the last
+BALANCE = (1.5, 1.0)  # powers of the errors, one after the other, by which each incident angle counts in the end
+END_SWEEPS = 2  # with each of them
 NO_ERROR = 1e-24  # squared, relative; below it is rounding
 
 
@@ -42,7 +42,7 @@ def grow(
         first_channels: Channels to start with.
     """
     channels = first_channels
-    factors, solved = _settle(fit, fit.start(), channels, START_GAIN)
+    factors, solved = _start(fit, channels)
 
     def expected(factors, channels: int) -> int:
         ranks = [f.shape[1] for f in factors]
@@ -64,27 +64,37 @@ def grow(
             if not fits(*trial):
                 continue
             if step.factor is None:
-                gained = solved.gain[channels]
+                core, gained = solved.value, solved.gain[channels]
             else:
-                gained = fit.added_gain(solved, factors, step.mode, step.factor)[:channels].sum()
+                core, gain = fit.widened_core(solved, factors, step.mode, step.factor)
+                gained = gain[:channels].sum()
             if gained >= LEAST_GAIN * error:
-                steps.append((_score(error, gained, expected(*trial) - held), step))
+                steps.append((_score(error, gained, expected(*trial) - held), step, core))
         if not steps:
             break
-        steps.sort(key=lambda pair: -pair[0])
-        before = factors
-        for score, step in steps:
+        steps.sort(key=lambda each: -each[0])
+        wider = []
+        for score, step, core in steps:
             trial = step.taken(factors, channels)
             if score >= ALIKE * steps[0][0] and fits(*trial):
                 factors, channels = trial
-        is_same = all(one is other for one, other in zip(before, factors, strict=True))  # a channel more, no column
-        factors = fit.sweep(factors, channels, solved if is_same else _core(fit, factors))
+                if step.factor is not None:
+                    wider.append(core)
+        if len(wider) > 1:
+            solved = _core(fit, factors)
+            core, projection = solved.value, solved.projection
+        else:
+            core, projection = wider[0] if wider else solved.value, fit.project(factors[2])
+        factors = fit.sweep(factors, core[..., :channels], projection)
         solved = _core(fit, factors)
-    settled, grown, weight = found, fit, 1.0
+    settled, grown = found, fit
     for power in BALANCE:
-        weight = weight * errors(settled) ** power
-        fit = grown.weighted(weight)
-        factors, solved = _settle(fit, factors, channels, END_GAIN)
+        weight = errors(settled) ** power
+        fit, projection = fit.weighted(weight), solved.projection.weighted(weight)
+        for _ in range(END_SWEEPS):
+            factors = fit.sweep(factors, solved.value[..., :channels], projection)
+            solved = _core(fit, factors)
+            projection = solved.projection
         settled = Factors(*factors, solved.value[..., :channels])
     if enough and not is_enough(settled):
         fit, settled = grown, found  # settled for all, not for the worst
@@ -113,16 +123,17 @@ def _steps(fit: TensorFit, found: Factors, most_channels: int) -> list[_Step]:
     return steps if found.core.shape[3] == most_channels else [*steps, _Step()]
 
 
-def _settle(fit: TensorFit, factors, channels: int, least_gain: float) -> tuple[list[np.ndarray], SolvedCore]:
-    """Sweep until the error hardly falls any more; return the factors and their core."""
+def _start(fit: TensorFit, channels: int) -> tuple[list[np.ndarray], SolvedCore]:
+    """Return the smallest factors, swept until the error hardly falls any more, and their core."""
+    factors = fit.start()
     solved = _core(fit, factors)
     error = fit.error(solved, channels)
     for _ in range(MOST_SWEEPS):
         before = error
-        factors = fit.sweep(factors, channels, solved)
+        factors = fit.sweep(factors, solved.value[..., :channels], solved.projection)
         solved = _core(fit, factors)
         error = fit.error(solved, channels)
-        if before - error <= least_gain * error:
+        if before - error <= START_GAIN * error:
             break
     return factors, solved
 

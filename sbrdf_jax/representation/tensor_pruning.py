@@ -62,29 +62,31 @@ def _turned(factors: Factors) -> Factors:
 
 
 class _Channel(NamedTuple):
-    """The cells that a channel has left."""
+    """The cells that a channel has left, and how their inverse matrix differs from that of all cells.
+
+    A lost cell is a pivot of an incomplete Cholesky factorisation of the inverse: with the rows
+    `lost` of the factor, the inverse without the lost cells is the whole one less `lost.T @ lost`.
+    """
 
     cells: Int[np.ndarray, " left"]
     value: Float[np.ndarray, " left"]  # of the scaled problem
-    inverse: Float[np.ndarray, "left left"]  # of its matrix
+    lost: Float[np.ndarray, "lost left"]
 
-    @property
-    def loss(self) -> Float[np.ndarray, " left"]:
+    def loss(self, inverse: Float[np.ndarray, "cell cell"]) -> Float[np.ndarray, " left"]:
         """By how much the squared error grows without each cell, all others solved anew."""
-        return self.value**2 / np.diag(self.inverse)
+        diagonal = np.diag(inverse)[self.cells] - np.einsum("lc,lc->c", self.lost, self.lost)
+        return self.value**2 / diagonal
 
-    def without(self, lost: Bool[np.ndarray, " left"]) -> "_Channel":
+    def without(self, lost: Bool[np.ndarray, " left"], inverse: Float[np.ndarray, "cell cell"]) -> "_Channel":
         """Take cells away and solve for the others anew, by a Schur complement of the inverse."""
         left, lost = np.flatnonzero(~lost), np.flatnonzero(lost)
-        if not len(left):
-            return _Channel(self.cells[left], self.value[left], self.inverse[:0, :0])
-        rows = self.inverse.take(lost, axis=0)
-        root = lower_root(rows.take(lost, axis=1))
+        kept, gone = self.lost.take(left, axis=1), self.lost.take(lost, axis=1)
+        rows = inverse.take(self.cells[lost], axis=0)
+        root = lower_root(rows.take(self.cells[lost], axis=1) - gone.T @ gone)
+        across = rows.take(self.cells[left], axis=1) - gone.T @ kept
         solve = functools.partial(scipy.linalg.blas.dtrsm, 1.0, root, lower=1)
-        across, value = solve(rows.take(left, axis=1)), solve(self.value[lost, None])
-        kept = self.inverse.take(left, axis=0).take(left, axis=1).T  # symmetric: the order of memory that BLAS takes
-        inverse = scipy.linalg.blas.dsyrk(-1.0, across, 1.0, kept, trans=1, lower=1, overwrite_c=1)
-        return _Channel(self.cells[left], self.value[left] - (value.T @ across)[0], mirrored(inverse))
+        across, value = solve(across), solve(self.value[lost, None])
+        return _Channel(self.cells[left], self.value[left] - (value.T @ across)[0], np.concatenate([kept, across]))
 
 
 class _Thinning:
@@ -93,9 +95,9 @@ class _Thinning:
     def __init__(self, fit: TensorFit, factors: Factors):
         matrix, _, self._scale = fit.core_problem(factors)
         self._factors = factors
-        inverse = inverse_of(matrix)
+        self._inverse = inverse_of(matrix)
         values = factors.core.reshape(len(matrix), -1) / self._scale[:, None]
-        self._channels = [_Channel(np.arange(len(matrix)), value, inverse) for value in values.T]
+        self._channels = [_Channel(np.arange(len(matrix)), value, np.zeros((0, len(matrix)))) for value in values.T]
 
     @property
     def count(self) -> int:
@@ -104,12 +106,12 @@ class _Thinning:
 
     def thin(self, count: int) -> None:
         """Keep the `count` cells whose loss is greatest."""
-        loss = np.concatenate([channel.loss for channel in self._channels])
+        loss = np.concatenate([channel.loss(self._inverse) for channel in self._channels])
         lost = np.ones(len(loss), bool)
         lost[np.argpartition(loss, -count)[-count:]] = False
         ends = np.cumsum([len(channel.cells) for channel in self._channels])[:-1]
         pairs = zip(self._channels, np.split(lost, ends), strict=True)
-        self._channels = [channel.without(gone) if gone.any() else channel for channel, gone in pairs]
+        self._channels = [channel.without(gone, self._inverse) if gone.any() else channel for channel, gone in pairs]
 
     def factors(self) -> Factors:
         """Return the factors with the core as it is now."""
