@@ -12,7 +12,7 @@ import numpy as np
 import scipy.linalg.blas
 from jaxtyping import Bool, Float, Int
 
-from sbrdf_jax.representation.tensor_fit import Factors, TensorFit, inverse_of, lower_root, mirrored
+from sbrdf_jax.representation.tensor_fit import Factors, TensorFit, inverse_of, lower_root
 
 ROUND = 0.84  # of its cells keeps a core in one round: the losses of cells change with the cells that are left
 WORD = 64  # cells of which one stored number says whether they are there
