@@ -72,11 +72,13 @@ def grow(
                 steps.append((_score(error, gained, expected(*trial) - held), step, core))
         if not steps:
             break
-        steps.sort(key=lambda each: -each[0])
+        alike = ALIKE * max(score for score, _, _ in steps)
+        steps = [each for each in steps if each[0] >= alike]
+        steps.sort(key=lambda each: (each[1].factor is not None, -each[0]))  # each column makes a channel dearer
         wider = []
-        for score, step, core in steps:
+        for _, step, core in steps:
             trial = step.taken(factors, channels)
-            if score >= ALIKE * steps[0][0] and fits(*trial):
+            if fits(*trial):
                 factors, channels = trial
                 if step.factor is not None:
                     wider.append(core)
