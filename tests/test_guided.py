@@ -10,6 +10,8 @@ import pytest
 import scipy.optimize
 
 from sbrdf_jax.cli import main
+from sbrdf_jax.coverage import cluster_incidences
+from sbrdf_jax.dropouts import find_dropouts
 from sbrdf_jax.evaluation import (
     evaluate,
     evaluate_in_chunks,
@@ -24,7 +26,7 @@ from sbrdf_jax.nnls import ProjectedNewton
 from sbrdf_jax.options import GridOptions, InputOptions, ResampleOptions
 from sbrdf_jax.records import RawSamples, Status
 from sbrdf_jax.report import draw_figures
-from sbrdf_jax.resampling.guided import describe_fit, fit_field, resample_guided
+from sbrdf_jax.resampling.guided import describe_fit, estimate_whole, fit_field, resample_guided
 from sbrdf_jax.resampling.guided.bounds import solve_bounded
 from sbrdf_jax.resampling.guided.centres import place_centres
 from sbrdf_jax.resampling.guided.coordinates import (
@@ -50,9 +52,10 @@ from sbrdf_jax.resampling.guided.error_model import (
     fit_between_scale,
     noise_factors,
 )
+from sbrdf_jax.resampling.guided.estimates import DROPOUT_NOISE
 from sbrdf_jax.resampling.guided.field import evaluate_on_axes as field_on_axes
 from sbrdf_jax.resampling.guided.field import evaluate_with_error, evaluated_part, field_whitener
-from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out, lower_inverse, mirror_lower
+from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out, lower_inverse, mirror_lower, without
 from sbrdf_jax.resampling.guided.lobe_fit import fit_lobe_model
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value, lobe_terms
 from sbrdf_jax.resampling.guided.lobe_slopes import lobe_slopes
@@ -222,6 +225,37 @@ def test_leave_group_out_equals_refits(rng):
     spread = matrix[np.ix_(held, held)] - cross @ np.linalg.solve(system, cross.T) + np.diag(np.asarray(noise)[held])
     np.testing.assert_allclose(variance[held], np.diag(spread), rtol=1e-7)
     assert not out[group == -1].any()
+
+
+def test_centres_left_out_for_good_are_as_if_they_had_not_been_measured(rng):
+    prior, noise, residual = (np.asarray(a) for a in random_problem(rng))
+    gone = np.zeros(len(noise), bool)
+    gone[[3, 4, 17]] = True
+    lower = np.tril(without(lower_inverse(prior, noise), gone))
+    out, dual = leave_one_out(lower, np.where(gone[:, None], 0.0, residual))
+    few = np.ix_(~gone, ~gone)
+    expected, of_others = leave_one_out(lower_inverse(prior[few], noise[~gone]), residual[~gone])
+    np.testing.assert_allclose(out[~gone], expected, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(dual[~gone], of_others, rtol=1e-8, atol=1e-8)
+    assert (dual[gone] == 0).all()
+
+
+def test_what_stands_beside_dropouts_is_not_doubted(samples):
+    angle = np.arccos(np.clip(np.cos(samples.theta_o - 0.4) * np.cos(samples.phi_o - 2.5), -1, 1))
+    row = np.flatnonzero(samples.theta_i == np.unique(samples.theta_i)[2])
+    planted = row[np.argsort(angle[row])[:2]]
+    value = samples.value.copy()
+    value[planted] = 1e-4
+    low = dataclasses.replace(samples, value=value)
+    assert set(np.flatnonzero(find_dropouts(low, cluster_incidences(low.theta_i)[1]))) == set(planted)
+    centres = place_centres(low)
+    estimates, clean = (estimate_whole(each, OPTIONS, centres) for each in (low, samples))
+    hidden = np.zeros(centres.count, bool)
+    hidden[centres.index[planted]] = True
+    assert (estimates.factor[hidden] == DROPOUT_NOISE).all()
+    np.testing.assert_allclose(estimates.factor[~hidden], clean.factor[~hidden], rtol=0.5)
+    assert estimates.noise_level == clean.noise_level
+    assert estimates.floor == pytest.approx(clean.floor, rel=0.1)
 
 
 @pytest.mark.parametrize("raised", [0.0, 10.0])  # by 10 the unbounded answer keeps the bound, and nothing is solved

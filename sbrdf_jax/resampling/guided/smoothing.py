@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sbrdf_jax.resampling.guided.centres import Centres
-from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out
+from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out, without
 from sbrdf_jax.resampling.guided.nodes import ModeVariance, Term, mode_variance
 
 CONSTANT = 1e-2  # variance of a constant, relative to the half-angle term's
@@ -41,7 +41,7 @@ def mean_root(residual: np.ndarray) -> float:
 
 
 def left_out_error(
-    centres: Centres, residual: np.ndarray, variance: ModeVariance, noise: float
+    centres: Centres, residual: np.ndarray, variance: ModeVariance, noise: float, dropped: np.ndarray
 ) -> tuple[float, np.ndarray]:
     """Geometric mean of the errors of left-out directions and of left-out incident angles, in z.
 
@@ -50,12 +50,15 @@ def left_out_error(
         residual: z minus the lobe model's [centre, wavelength].
         variance: The prior.
         noise: Noise variance of one sample.
+        dropped: Mask of the centres that are not to be trusted: they are as if they had not been measured.
 
     Returns:
         The error, inf where there is none, and the leave-one-out residuals [centre, wavelength].
     """
-    seen = centres.number > 0
+    seen = (centres.number > 0) & ~dropped
     lower = centres.lower_inverse(variance, noise)
+    if dropped.any():
+        lower, residual = without(lower, dropped), np.where(dropped[:, None], 0.0, residual)
     out, dual = leave_one_out(lower, residual)
     error = mean_root(out[seen])
     if centres.num_groups > 1:
@@ -63,20 +66,21 @@ def left_out_error(
     return error if np.isfinite(error) else np.inf, out
 
 
-def choose_smoothing(centres: Centres, residual: np.ndarray, noise: float | None) -> Choice:
+def choose_smoothing(centres: Centres, residual: np.ndarray, noise: float | None, dropped: np.ndarray) -> Choice:
     """Choose how smooth the residual is: the noise climbs a ladder while `left_out_error` falls.
 
     Args:
         centres: Where the samples are.
         residual: z minus the lobe model's [centre, wavelength].
         noise: Fixed relative noise variance; None: chosen.
+        dropped: As for `left_out_error`.
     """
     variance = mode_variance(PRIOR, CONSTANT, centres.reciprocal)
     tried: dict[float, tuple[float, np.ndarray]] = {}
 
     def error(level: float) -> float:
         if level not in tried:
-            tried[level] = left_out_error(centres, residual, variance, level)
+            tried[level] = left_out_error(centres, residual, variance, level, dropped)
         return tried[level][0]
 
     if noise is None:
@@ -89,7 +93,7 @@ def choose_smoothing(centres: Centres, residual: np.ndarray, noise: float | None
     cost = 1.0
     if centres.reciprocal:
         free = mode_variance(PRIOR, CONSTANT)
-        cost = error(noise) / left_out_error(centres, residual, free, noise)[0]
+        cost = error(noise) / left_out_error(centres, residual, free, noise, dropped)[0]
     error(noise)
     curve = tuple((level, found[0]) for level, found in sorted(tried.items()))
     return Choice(variance, noise, curve, tried[noise][1], cost)
