@@ -46,7 +46,10 @@ ACTION_AND_REASON = {
     Flag.NEGATIVE: ("flagged", "some value is negative: noise round a small value, kept"),
     Flag.ZERO: ("flagged", "some value is exactly 0: at or below the noise, not a measurement of 0; kept"),
     Flag.DUPLICATE: ("flagged", "its direction was measured before; each counts as a measurement"),
-    Flag.DROPOUT: ("flagged", "far below its angular neighbours at most wavelengths: probably a drop-out; kept, and trusted less by guided"),
+    Flag.DROPOUT: (
+        "flagged",
+        "far below its angular neighbours at most wavelengths: probably a drop-out; kept, and trusted less by guided",
+    ),
     Flag.FOLDED: ("folded", "bilateral sample: used at its mirror image, phi_o from 0 to 180 degrees"),
 }
 

@@ -59,7 +59,7 @@ def spread_rows(count: int) -> np.ndarray:
 
 
 def noise_factors(half: np.ndarray, theta_i: np.ndarray, theta_o: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Noise variance of each sample relative to its neighbours', from leave-one-out residuals.
+    """Noise variance of each sample relative to its neighbours', from leave-one-out residuals in units of their spread.
 
     A sample whose residual is more than `OUTLIER` times what its neighbours show is a drop-out
     or a glint: its weight falls, but not to nothing.
@@ -68,7 +68,8 @@ def noise_factors(half: np.ndarray, theta_i: np.ndarray, theta_o: np.ndarray, re
         half: log(theta_h [deg] + 1) [sample].
         theta_i: Incident polar angles [rad].
         theta_o: Outgoing polar angles [rad].
-        residual: Leave-one-out residuals in z [sample, wavelength].
+        residual: Leave-one-out residuals in z [sample, wavelength]; those of directions far from others scaled down
+            to what they would be among others.
     """
     size = np.maximum(np.sqrt(np.mean(np.clip(residual, -1.0, 1.0) ** 2, axis=1)), 1e-5)
     place = np.stack([half, theta_i, theta_o], axis=1) / np.asarray(NEIGHBOUR_SCALE)

@@ -34,7 +34,7 @@ from sbrdf_jax.resampling.guided.smoothing import choose_smoothing
 from sbrdf_jax.resampling.guided.spectrum import SpectralFilter, spectral_filter
 
 CALIBRATION_GROUPS = 5
-DROPOUT_NOISE = 2.0  # variance relative to others: what stands in the way hides what lies beside it, but nothing else
+DROPOUT_NOISE = 1.5  # variance relative to others: what stands in the way hides what lies beside it, but nothing else
 TINY = 1e-12  # variance relative to the prior's
 
 
@@ -103,10 +103,11 @@ def estimate(
     say("smoothness")
     choice = choose_smoothing(centres, residual, weight, dropped)
     factor = np.ones(centres.count)
-    factor[seen] = noise_factors(half[seen], *centres.angles[:2, seen], choice.left_out[seen])
+    left_out, spread = choice.left_out
+    factor[seen] = noise_factors(half[seen], *centres.angles[:2, seen], left_out[seen] / spread[seen, None])
     factor[dropped] = DROPOUT_NOISE
     noise = centres.noise(choice.noise) * factor
-    spectra = spectral_filter((model + residual)[seen], choice.left_out[seen])
+    spectra = spectral_filter((model + residual)[seen], left_out[seen])
     if spectra.to_component.size:  # the amplitudes have noise of single wavelengths too
         filtered = spectra(model + residual)
         value = from_log(filtered, log_scale(centres.at, floor))

@@ -25,13 +25,20 @@ NOISE_LADDER = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1, 3e-1)  # noise variance rela
 FIRST_NOISE = 3e-3
 
 
+class LeftOut(NamedTuple):
+    """What is known of directions that are left out, one by one."""
+
+    residual: np.ndarray  # [centre, wavelength]
+    spread: np.ndarray  # [centre] how far they may be off, relative to the median: those far from others are more
+
+
 class Choice(NamedTuple):
     """A noise level, and the curve that led to it: (noise, left-out error) each."""
 
     variance: ModeVariance
     noise: float
     curve: tuple[tuple[float, float], ...]
-    left_out: np.ndarray  # [centre, wavelength] leave-one-out residuals
+    left_out: LeftOut
     reciprocity_cost: float  # left-out error with nodes tied by reciprocity over that without; 1 where not tied
 
 
@@ -42,7 +49,7 @@ def mean_root(residual: np.ndarray) -> float:
 
 def left_out_error(
     centres: Centres, residual: np.ndarray, variance: ModeVariance, noise: float, dropped: np.ndarray
-) -> tuple[float, np.ndarray]:
+) -> tuple[float, LeftOut]:
     """Geometric mean of the errors of left-out directions and of left-out incident angles, in z.
 
     Args:
@@ -53,7 +60,7 @@ def left_out_error(
         dropped: Mask of the centres that are not to be trusted: they are as if they had not been measured.
 
     Returns:
-        The error, inf where there is none, and the leave-one-out residuals [centre, wavelength].
+        The error, inf where there is none, and what it comes from.
     """
     seen = (centres.number > 0) & ~dropped
     lower = centres.lower_inverse(variance, noise)
@@ -63,7 +70,8 @@ def left_out_error(
     error = mean_root(out[seen])
     if centres.num_groups > 1:
         error = float(np.sqrt(error * mean_root(leave_group_out(lower, dual, centres.group)[0][seen])))
-    return error if np.isfinite(error) else np.inf, out
+    spread = 1 / np.sqrt(np.diag(lower))
+    return error if np.isfinite(error) else np.inf, LeftOut(out, spread / np.median(spread[seen]))
 
 
 def choose_smoothing(centres: Centres, residual: np.ndarray, noise: float | None, dropped: np.ndarray) -> Choice:
@@ -76,7 +84,7 @@ def choose_smoothing(centres: Centres, residual: np.ndarray, noise: float | None
         dropped: As for `left_out_error`.
     """
     variance = mode_variance(PRIOR, CONSTANT, centres.reciprocal)
-    tried: dict[float, tuple[float, np.ndarray]] = {}
+    tried: dict[float, tuple[float, LeftOut]] = {}
 
     def error(level: float) -> float:
         if level not in tried:
