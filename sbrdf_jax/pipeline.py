@@ -177,6 +177,7 @@ def process(
             "represent": searched,
             "coefficients_used": used,
             "wavelengths_met_at_start": met_at_start(gridded),
+            "spectral_components_kept": components_kept(gridded),
             "scene": describe_needs(needs, raw.wavelength_nm, gridded),
         },
         timing=timing,
@@ -189,6 +190,14 @@ def process(
 def met_at_start(gridded: GriddedBRDF) -> int:
     """Count the wavelengths whose start was within the tolerance: they took no step."""
     return int(np.sum((np.asarray(gridded.num_steps) == 0) & (np.asarray(gridded.status) == int(Status.OK))))
+
+
+def components_kept(gridded: GriddedBRDF) -> int:
+    """Count the dimensions of the spectra that the resampling kept: method guided leaves out those that are noise."""
+    if gridded.field is None:
+        return len(gridded.wavelength_nm)
+    measured = gridded.field.measured
+    return np.shape(measured.to_component)[1] or len(measured.wavelength_nm)
 
 
 def storage_scores(compact, rounding: np.ndarray, gridded: GriddedBRDF) -> dict[str, np.ndarray]:

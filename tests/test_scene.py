@@ -254,6 +254,8 @@ def test_a_result_keeps_its_scene_and_reads_back(folder, samples):
     np.testing.assert_array_equal(np.flatnonzero(mask), [1, 4, 7])
     steps = np.asarray(whole.gridded.num_steps)
     assert whole.plan["wavelengths_met_at_start"] == np.count_nonzero(steps == 0)
+    kept = np.shape(whole.gridded.field.measured.to_component)[1] or whole.gridded.brdf.shape[-1]
+    assert some.plan["spectral_components_kept"] == whole.plan["spectral_components_kept"] == kept
     np.testing.assert_allclose(
         some.gridded.brdf, whole.gridded.brdf[..., [1, 4, 7]], rtol=0, atol=1e-9 * whole.gridded.brdf.max()
     )
