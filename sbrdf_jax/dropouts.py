@@ -7,6 +7,8 @@ large factor is a drop-out. A lone low sample and a short row of them are found 
 slope, a valley or a dark half of the hemisphere overflows at its own level and is not.
 """
 
+import functools
+
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import Delaunay
@@ -46,7 +48,8 @@ def find_dropouts(samples: RawSamples, incidence: Int[np.ndarray, " sample"]) ->
         noise = spectral_noise(value)
         if noise > 0:
             level = np.log(np.maximum(value, 0) + noise).mean(axis=1)
-            mask[member] = _low(level, *_neighbours(samples.theta_o[member], samples.phi_o[member]))
+            angles = (np.asarray(a[member], np.float64).tobytes() for a in (samples.theta_o, samples.phi_o))
+            mask[member] = _low(level, *_neighbours(*angles))
     return mask
 
 
@@ -126,11 +129,13 @@ def _flood(samples: np.ndarray, level: np.ndarray, start: np.ndarray, index: np.
     return basin, np.where(full, height[basin].max(axis=1), -np.inf)
 
 
-def _neighbours(theta_o: np.ndarray, phi_o: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+@functools.lru_cache(maxsize=64)
+def _neighbours(theta_o: bytes, phi_o: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Return (start, index): the neighbours of direction k are index[start[k] : start[k + 1]].
 
-    By triangulation, or along a scan in one plane.
+    By triangulation, or along a scan in one plane; kept for the next measurement in the same directions.
     """
+    theta_o, phi_o = np.frombuffer(theta_o), np.frombuffer(phi_o)
     radius = 2 * np.sin(theta_o / 2)  # equal-area
     point = np.stack([radius * np.cos(phi_o), radius * np.sin(phi_o)], axis=1)
     centred = point - point.mean(axis=0)
