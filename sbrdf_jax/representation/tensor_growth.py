@@ -1,6 +1,6 @@
 """Which ranks a lobe tensor has: grown step by step, by the error that each stored number takes away.
 
-Growth counts half of the core's cells; at its end those that matter least are left out.
+Growth counts a part of the core's cells; at its end those that matter least are left out.
 """
 
 from collections.abc import Callable
@@ -12,13 +12,12 @@ from jaxtyping import Float
 from sbrdf_jax.representation.tensor_fit import Factors, SolvedCore, TensorFit
 from sbrdf_jax.representation.tensor_pruning import num_words, prune
 
-KEPT = 0.5  # of the core's cells, as growth counts them: what pruning takes away costs hardly any error
-MOST_CELLS = 1500  # of the core for one channel; its normal equations have so many unknowns
+KEPT = 0.45  # of the core's cells, as growth counts them: what pruning takes away costs hardly any error
+MOST_CELLS = 1800  # of the core for one channel; its normal equations have so many unknowns
 ALIKE = 0.8  # of the best step's score: such steps are taken with it
 LEAST_GAIN = 2e-3  # of the squared error; a step that gains less is noise, and growth ends
 MOST_SWEEPS, START_GAIN = 30, 0.02  # before the growth; of the squared error: a sweep that gains less is the last
-BALANCE = (1.5, 1.0)  # powers of the errors, one after the other, by which each incident angle counts in the end
-END_SWEEPS = 2  # with each of them
+BALANCE = (3.0, 1.0)  # powers of the errors, one after the other, by which each incident angle counts in the end
 NO_ERROR = 1e-24  # squared, relative; below it is rounding
 
 
@@ -93,10 +92,8 @@ def grow(
     for power in BALANCE:
         weight = errors(settled) ** power
         fit, projection = fit.weighted(weight), solved.projection.weighted(weight)
-        for _ in range(END_SWEEPS):
-            factors = fit.sweep(factors, solved.value[..., :channels], projection)
-            solved = _core(fit, factors)
-            projection = solved.projection
+        factors = fit.sweep(factors, solved.value[..., :channels], projection)
+        solved = _core(fit, factors)
         settled = Factors(*factors, solved.value[..., :channels])
     if enough and not is_enough(settled):
         fit, settled = grown, found  # settled for all, not for the worst
