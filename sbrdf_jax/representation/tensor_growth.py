@@ -17,7 +17,7 @@ MOST_CELLS = 1800  # of the core for one channel; its normal equations have so m
 ALIKE = 0.8  # of the best step's score: such steps are taken with it
 LEAST_GAIN = 2e-3  # of the squared error; a step that gains less is noise, and growth ends
 MOST_SWEEPS, START_GAIN = 30, 0.02  # before the growth; of the squared error: a sweep that gains less is the last
-BALANCE = (3.0, 1.0)  # powers of the errors, one after the other, by which each incident angle counts in the end
+BALANCE = (2.0, 1.0)  # powers of the errors, one after the other, by which each incident angle counts in the end
 NO_ERROR = 1e-24  # squared, relative; below it is rounding
 
 
