@@ -12,7 +12,7 @@ from jaxtyping import Float
 from sbrdf_jax.representation.tensor_fit import Factors, SolvedCore, TensorFit
 from sbrdf_jax.representation.tensor_pruning import num_words, prune
 
-KEPT = 0.45  # of the core's cells, as growth counts them: what pruning takes away costs hardly any error
+KEPT, LESS_KEPT, LARGE = 0.5, 0.05, 8000  # of the core's cells, as growth counts them; so much less of so many cells
 MOST_CELLS = 1800  # of the core for one channel; its normal equations have so many unknowns
 ALIKE = 0.8  # of the best step's score: such steps are taken with it
 LEAST_GAIN = 2e-3  # of the squared error; a step that gains less is noise, and growth ends
@@ -46,7 +46,8 @@ def grow(
     def expected(factors, channels: int) -> int:
         ranks = [f.shape[1] for f in factors]
         cells = int(np.prod(ranks)) * channels
-        return numbers(*ranks, channels, int(KEPT * cells) + num_words(cells))
+        kept = KEPT - LESS_KEPT * min(1.0, cells / LARGE)  # what pruning takes away costs hardly any error
+        return numbers(*ranks, channels, int(kept * cells) + num_words(cells))
 
     def fits(factors, channels: int) -> bool:
         return bool(np.prod([f.shape[1] for f in factors]) <= MOST_CELLS and expected(factors, channels) <= budget)
