@@ -202,14 +202,14 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
         return np.interp(rows, nodes.theta_i[counts], np.clip(share, *SHARES))
 
     first = min(2, count) if layout.stores_vectors else count
-    share, spectra = float(np.mean(nodes.needed)), layout.num_wavelengths if layout.stores_vectors else 0
+    # what whole hemispheres may cost is too much for a part of them
+    share, axes = float(np.mean(nodes.needed)), layout.numbers(0, 0, 0, 0, 0)
+    spectra = layout.num_wavelengths if layout.stores_vectors else 0
 
     def numbers(*sizes: int) -> int:
         """Count numbers; of axes and spectra, which all hemispheres share, those that a part of them is to pay for."""
         return layout.numbers(*sizes) - int((1 - share) * (axes + spectra * sizes[3]))
 
-    # what whole hemispheres may cost is too much for a part of them
-    axes = layout.numbers(0, 0, 0, 0, 0)
     factors = grow(fit, numbers, share * target.budget, is_enough, errors, first_channels=first)
     achieved, used = measure(target, factors), factors.core.shape[3]
     worst = measure(target._replace(kind="error"), factors) if target.is_size else achieved

@@ -51,10 +51,6 @@ class Projection(NamedTuple):
     gram: Float[np.ndarray, "i o q q"]
     moment: Float[np.ndarray, "i o q channel"]
 
-    def weighted(self, weight: Float[np.ndarray, " i"]) -> "Projection":
-        """Return the sums where squared errors at each row of theta_i count `weight` times as much."""
-        return Projection(*(array * weight[:, None, None, None] for array in self))
-
 
 class CoreProblem(NamedTuple):
     """Normal equations of a core, their diagonal scaled to 1 and the ridge on it."""

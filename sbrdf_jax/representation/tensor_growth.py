@@ -12,7 +12,8 @@ from jaxtyping import Float
 from sbrdf_jax.representation.tensor_fit import Factors, SolvedCore, TensorFit
 from sbrdf_jax.representation.tensor_pruning import num_words, prune
 
-KEPT, LESS_KEPT, LARGE = 0.5, 0.05, 8000  # of the core's cells, as growth counts them; so much less of so many cells
+KEPT = 0.5  # of the core's cells, as growth counts them: what pruning takes away costs hardly any error
+LESS_KEPT, LARGE = 0.05, 8000  # so much less than that of so many cells or more, which can be pruned better
 MOST_CELLS = 1800  # of the core for one channel; its normal equations have so many unknowns
 ALIKE = 0.8  # of the best step's score: such steps are taken with it
 LEAST_GAIN = 2e-3  # of the squared error; a step that gains less is noise, and growth ends
@@ -46,7 +47,7 @@ def grow(
     def expected(factors, channels: int) -> int:
         ranks = [f.shape[1] for f in factors]
         cells = int(np.prod(ranks)) * channels
-        kept = KEPT - LESS_KEPT * min(1.0, cells / LARGE)  # what pruning takes away costs hardly any error
+        kept = KEPT - LESS_KEPT * min(1.0, cells / LARGE)
         return numbers(*ranks, channels, int(kept * cells) + num_words(cells))
 
     def fits(factors, channels: int) -> bool:
@@ -91,11 +92,9 @@ def grow(
         solved = _core(fit, factors)
     settled, grown = found, fit
     for power in BALANCE:
-        weight = errors(settled) ** power
-        fit, projection = fit.weighted(weight), solved.projection.weighted(weight)
-        factors = fit.sweep(factors, solved.value[..., :channels], projection)
-        solved = _core(fit, factors)
-        settled = Factors(*factors, solved.value[..., :channels])
+        fit = fit.weighted(errors(settled) ** power)
+        factors = fit.sweep(settled[:3], settled.core, fit.project(settled.direction))
+        settled = Factors(*factors, _core(fit, factors).value[..., :channels])
     if enough and not is_enough(settled):
         fit, settled = grown, found  # settled for all, not for the worst
     cells = np.size(settled.core)

@@ -38,10 +38,8 @@ def prune(fit: TensorFit, factors: Factors, most: int, is_enough: Callable[[Fact
         is_enough: Asked after each round below `most`; the last that is enough is returned. None: there is none below.
     """
     thinning = _Thinning(fit, _turned(factors))
-    while ROUND * thinning.count > most:
-        thinning.thin(int(ROUND * thinning.count))
-    if thinning.count > most:
-        thinning.thin(most, is_last=is_enough is None)
+    while thinning.count > most:
+        thinning.thin(max(int(ROUND * thinning.count), most))
     found = thinning.factors()
     while is_enough is not None and thinning.count > 1:
         thinning.thin(int(ROUND * thinning.count))
@@ -66,37 +64,29 @@ def _turned(factors: Factors) -> Factors:
 class _Channel(NamedTuple):
     """The cells that a channel has left, and how their inverse matrix differs from that of all cells.
 
-    A lost cell is a pivot of an incomplete Cholesky factorisation of the inverse: with the rows
-    `lost` of the factor, the inverse without the lost cells is the whole one less `lost.T @ lost`.
+    A lost cell is a pivot of an incomplete Cholesky factorisation of the inverse: with its rows `pivot`,
+    the inverse without the lost cells is the whole one less `pivot.T @ pivot`.
     """
 
     cells: Int[np.ndarray, " left"]
     value: Float[np.ndarray, " left"]  # of the scaled problem
-    lost: Float[np.ndarray, "lost left"]
+    pivot: Float[np.ndarray, "lost left"]
 
     def loss(self, inverse: Float[np.ndarray, "cell cell"]) -> Float[np.ndarray, " left"]:
         """By how much the squared error grows without each cell, all others solved anew."""
-        diagonal = np.diag(inverse)[self.cells] - np.einsum("lc,lc->c", self.lost, self.lost)
+        diagonal = np.diag(inverse)[self.cells] - np.einsum("lc,lc->c", self.pivot, self.pivot)
         return self.value**2 / diagonal
 
-    def without(
-        self, lost: Bool[np.ndarray, " left"], inverse: Float[np.ndarray, "cell cell"], is_last: bool
-    ) -> "_Channel":
-        """Take cells away and solve for the others anew, by a Schur complement of the inverse.
-
-        The last time, the values are all that is wanted, and the matrix of the complement is not made.
-        """
+    def without(self, lost: Bool[np.ndarray, " left"], inverse: Float[np.ndarray, "cell cell"]) -> "_Channel":
+        """Take cells away and solve for the others anew, by a Schur complement of the inverse."""
         left, lost = np.flatnonzero(~lost), np.flatnonzero(lost)
-        kept, gone = self.lost.take(left, axis=1), self.lost.take(lost, axis=1)
+        kept, gone = self.pivot.take(left, axis=1), self.pivot.take(lost, axis=1)
+        if not len(left):
+            return _Channel(self.cells[left], self.value[left], kept)
         rows = inverse.take(self.cells[lost], axis=0)
         root = lower_root(rows.take(self.cells[lost], axis=1) - gone.T @ gone)
         solve = functools.partial(scipy.linalg.blas.dtrsm, 1.0, root, lower=1)
-        value = solve(self.value[lost, None])
-        if is_last:
-            value = solve(value, trans_a=1)[:, 0]
-            change = (value @ rows).take(self.cells[left]) - (gone @ value) @ kept
-            return _Channel(self.cells[left], self.value[left] - change, kept)
-        across = solve(rows.take(self.cells[left], axis=1) - gone.T @ kept)
+        across, value = solve(rows.take(self.cells[left], axis=1) - gone.T @ kept), solve(self.value[lost, None])
         return _Channel(self.cells[left], self.value[left] - (value.T @ across)[0], np.concatenate([kept, across]))
 
 
@@ -115,16 +105,14 @@ class _Thinning:
         """Number of cells left."""
         return sum(len(channel.cells) for channel in self._channels)
 
-    def thin(self, count: int, *, is_last: bool = False) -> None:
-        """Keep the `count` cells whose loss is greatest; after the last time no more can be taken away."""
+    def thin(self, count: int) -> None:
+        """Keep the `count` cells whose loss is greatest."""
         loss = np.concatenate([channel.loss(self._inverse) for channel in self._channels])
         lost = np.ones(len(loss), bool)
         lost[np.argpartition(loss, -count)[-count:]] = False
         ends = np.cumsum([len(channel.cells) for channel in self._channels])[:-1]
         pairs = zip(self._channels, np.split(lost, ends), strict=True)
-        self._channels = [
-            channel.without(gone, self._inverse, is_last) if gone.any() else channel for channel, gone in pairs
-        ]
+        self._channels = [channel.without(gone, self._inverse) if gone.any() else channel for channel, gone in pairs]
 
     def factors(self) -> Factors:
         """Return the factors with the core as it is now."""

@@ -103,11 +103,13 @@ def estimate(
     say("smoothness")
     choice = choose_smoothing(centres, residual, weight, dropped)
     factor = np.ones(centres.count)
-    left_out, spread = choice.left_out
-    factor[seen] = noise_factors(half[seen], *centres.angles[:2, seen], left_out[seen] / spread[seen, None])
+    left_out = choice.left_out
+    factor[seen] = noise_factors(
+        half[seen], *centres.angles[:2, seen], left_out.residual[seen] / left_out.spread[seen, None]
+    )
     factor[dropped] = DROPOUT_NOISE
     noise = centres.noise(choice.noise) * factor
-    spectra = spectral_filter((model + residual)[seen], left_out[seen])
+    spectra = spectral_filter((model + residual)[seen], left_out.residual[seen])
     if spectra.to_component.size:  # the amplitudes have noise of single wavelengths too
         filtered = spectra(model + residual)
         value = from_log(filtered, log_scale(centres.at, floor))
