@@ -48,7 +48,7 @@ ACTION_AND_REASON = {
     Flag.DUPLICATE: ("flagged", "its direction was measured before; each counts as a measurement"),
     Flag.DROPOUT: (
         "flagged",
-        "far below its angular neighbours at most wavelengths: probably a drop-out; kept, and trusted less by guided",
+        "far below its angular neighbours at most wavelengths: something stood in the way; left out by method guided",
     ),
     Flag.FOLDED: ("folded", "bilateral sample: used at its mirror image, phi_o from 0 to 180 degrees"),
 }
@@ -106,7 +106,8 @@ def clean(raw: RawSamples, *, bilateral: bool | Literal["auto"] = "auto", method
 
     A row is dropped if an angle or a value of it is not finite, or if it lies below the horizon. A
     wavelength that is not finite in more than half of the rows is a dead channel: it is NaN in
-    every sample afterwards, so its lane fails alone, and it drops no row. phi_o stays as measured:
+    every sample afterwards, so its lane fails alone, and it drops no row. Method "guided" leaves out
+    drop-outs too: what stood in the way says nothing of the surface. phi_o stays as measured:
     the grid of a bilateral sample folds it, and the report counts what is folded.
 
     Args:
@@ -152,7 +153,10 @@ def clean(raw: RawSamples, *, bilateral: bool | Literal["auto"] = "auto", method
         mark(bit, where[wrong.any(axis=1)])
         values[bit] = int(wrong.sum())
     mark(Flag.DUPLICATE, where[_repeated(kept)])
-    mark(Flag.DROPOUT, where[find_dropouts(kept, cluster_incidences(kept.theta_i)[1])])
+    low = find_dropouts(kept, cluster_incidences(kept.theta_i)[1])
+    mark(Flag.DROPOUT, where[low])
+    leave_out = low & (method == "guided")
+    kept, where = kept.take(~leave_out), where[~leave_out]
 
     coverage = find_coverage(kept)
     folded = resolve_bilateral(bilateral, method, coverage)
@@ -160,7 +164,7 @@ def clean(raw: RawSamples, *, bilateral: bool | Literal["auto"] = "auto", method
         mark(Flag.FOLDED, where[(kept.phi_o > np.pi + HALF_TURN_TOLERANCE) & (kept.theta_o > 0)])
     report = CleanReport(
         flag=flag,
-        entries=tuple(_entry(bit, flag, values[bit], raw) for bit in ACTION_AND_REASON),
+        entries=tuple(_entry(bit, flag, values[bit], raw, method) for bit in ACTION_AND_REASON),
         dead_wavelength_nm=raw.wavelength_nm[dead],
         num_rows=raw.num_samples,
         num_kept=kept.num_samples,
@@ -189,7 +193,7 @@ def _repeated(samples: RawSamples) -> np.ndarray:
     return again
 
 
-def _entry(bit: Flag, flag: np.ndarray, values: int, raw: RawSamples) -> CleanEntry:
+def _entry(bit: Flag, flag: np.ndarray, values: int, raw: RawSamples, method: str) -> CleanEntry:
     """Return the line of the table for one flag."""
     rows = np.flatnonzero(flag & np.uint16(bit))
     angles = np.degrees(np.stack([raw.theta_i, raw.theta_o, raw.phi_o], axis=1))
@@ -198,4 +202,6 @@ def _entry(bit: Flag, flag: np.ndarray, values: int, raw: RawSamples) -> CleanEn
         for r in rows[:NUM_EXAMPLES]
     )
     action, reason = ACTION_AND_REASON[bit]
+    if bit == Flag.DROPOUT and method == "guided":
+        action = "dropped"
     return CleanEntry(str(bit.name).lower(), action, len(rows), values, reason, examples)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sbrdf_jax.angles import half_angle
-from sbrdf_jax.cleaning import DROPPED, CleanReport, clean
+from sbrdf_jax.cleaning import DROPPED, CleanReport, Flag, clean
 from sbrdf_jax.coverage import cluster_incidences
 from sbrdf_jax.evaluation import evaluate_in_chunks
 from sbrdf_jax.folds import LEAVE_ONE_OUT, Folds
@@ -22,6 +22,7 @@ from sbrdf_jax.records import RawSamples
 from sbrdf_jax.resampling import resample
 from sbrdf_jax.resampling.guided import Centres, fit_field, place_centres
 from sbrdf_jax.resampling.guided.field import evaluate_with_error, evaluated_part
+from sbrdf_jax.resampling.guided.shadows import measured_value
 from sbrdf_jax.scores import coverage, coverage_by, held_out_scores, scores_by_half_angle
 
 
@@ -53,8 +54,9 @@ def predict(
     phi_o: Float[np.ndarray, " direction"],
     report: Callable[[str], None] | None = None,
     centres: Centres | None = None,
+    dropouts: RawSamples | None = None,
 ) -> Prediction:
-    """Fit cleaned samples and evaluate the fitted field at other directions [rad].
+    """Fit cleaned samples and tell what would be measured in other directions [rad].
 
     The one place where validation meets a method.
 
@@ -67,12 +69,17 @@ def predict(
         phi_o: Azimuth of exitance [rad].
         report: Told how far it is.
         centres: For method guided, what depends on angles alone.
+        dropouts: For method guided, the samples that cleaning left out: the fitted field knows nothing of what stood
+            in the way there, but a measurement would.
     """
     angles = theta_i, theta_o, phi_o
     if options.method == "guided":
         fit = fit_field(train, options, report, None if centres is None else centres.take(train.row))
-        value, error, noise = evaluate_with_error(evaluated_part(fit.field), fit.whiten, *angles)
-        return Prediction(np.asarray(value), fit.status, np.hypot(error, noise))
+        field = evaluated_part(fit.field)
+        value, error, noise = map(np.asarray, evaluate_with_error(field, fit.whiten, *angles))
+        hidden = dropouts is not None and dropouts.num_samples > 0
+        shaded = measured_value(field, value, angles, train, dropouts) if hidden else value
+        return Prediction(shaded, fit.status, np.sqrt(error**2 + noise**2 + (value - shaded) ** 2))
     gridded = resample(train, grid, options, report)
     return Prediction(evaluate_in_chunks(gridded, *angles), np.asarray(gridded.status, int))
 
@@ -122,9 +129,11 @@ def predict_held_out(
                 report(f"{place}: {text}")
 
         held_out = folds.label == label
-        train = clean(raw.take(~held_out), bilateral=bilateral, method=options.method).samples
+        rest = raw.take(~held_out)
+        cleaned = clean(rest, bilateral=bilateral, method=options.method)
+        dropouts = rest.take((cleaned.report.flag & np.uint16(Flag.DROPOUT)) > 0)
         angles = np.minimum(raw.theta_i[held_out], top), np.minimum(raw.theta_o[held_out], top), raw.phi_o[held_out]
-        found = predict(train, grid, options, *angles, say, centres)
+        found = predict(cleaned.samples, grid, options, *angles, say, centres, dropouts)
         predicted[held_out], status[number] = found.value, found.status
         if found.expected_error is not None:
             expected[held_out] = found.expected_error

@@ -1,4 +1,4 @@
-"""What the data say about their own errors: floor, drop-outs, and the local scale of the residuals."""
+"""What the data say about their own errors: floor, outliers, and the local scale of the residuals."""
 
 import dataclasses
 from typing import Any
@@ -18,7 +18,7 @@ TO_SIGMA = 1.4826  # median absolute deviation to standard deviation
 NUM_NEIGHBOURS = 25
 NEIGHBOUR_SCALE = (0.5, 0.25, 0.4)  # of half, theta_i, theta_o, where residuals are compared
 OUTLIER = 5.0  # residuals so many times the local scale begin to lose weight
-MAX_FACTOR = 4.0  # largest noise variance of an outlier, relative; clusters of drop-outs keep some say
+MAX_FACTOR = 100.0  # largest noise variance of an outlier, relative: next to no weight
 SAMPLES_OF_SPECTRUM = 8
 COVERED = 0.6827
 SORTED_TOGETHER = 256  # residuals whose weights are summed before the sum is looked into
@@ -59,17 +59,15 @@ def spread_rows(count: int) -> np.ndarray:
 
 
 def noise_factors(half: np.ndarray, theta_i: np.ndarray, theta_o: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Noise variance of each sample relative to its neighbours', from leave-one-out residuals in units of their spread.
+    """Noise variance of each sample relative to its neighbours', from leave-one-out residuals.
 
-    A sample whose residual is more than `OUTLIER` times what its neighbours show is a drop-out
-    or a glint: its weight falls, but not to nothing.
+    A sample whose residual is more than `OUTLIER` times what its neighbours show is a glint or a fault.
 
     Args:
         half: log(theta_h [deg] + 1) [sample].
         theta_i: Incident polar angles [rad].
         theta_o: Outgoing polar angles [rad].
-        residual: Leave-one-out residuals in z [sample, wavelength]; those of directions far from others scaled down
-            to what they would be among others.
+        residual: Leave-one-out residuals in z [sample, wavelength].
     """
     size = np.maximum(np.sqrt(np.mean(np.clip(residual, -1.0, 1.0) ** 2, axis=1)), 1e-5)
     place = np.stack([half, theta_i, theta_o], axis=1) / np.asarray(NEIGHBOUR_SCALE)

@@ -11,8 +11,6 @@ import jax
 import numpy as np
 
 from sbrdf_jax.angles import fold_azimuth
-from sbrdf_jax.coverage import cluster_incidences
-from sbrdf_jax.dropouts import find_dropouts
 from sbrdf_jax.records import RawSamples
 from sbrdf_jax.resampling.guided.centres import Centres
 from sbrdf_jax.resampling.guided.coordinates import from_log, guided_coordinates, log_scale, slope, to_log
@@ -34,7 +32,6 @@ from sbrdf_jax.resampling.guided.smoothing import choose_smoothing
 from sbrdf_jax.resampling.guided.spectrum import SpectralFilter, spectral_filter
 
 CALIBRATION_GROUPS = 5
-DROPOUT_NOISE = 1.5  # variance relative to others: what stands in the way hides what lies beside it, but nothing else
 TINY = 1e-12  # variance relative to the prior's
 
 
@@ -83,13 +80,8 @@ def estimate(
         report: Told of each step.
     """
     say = report or (lambda _: None)
-    low = find_dropouts(samples, cluster_incidences(samples.theta_i)[1])
-    dropped = np.zeros(centres.count, bool)
-    dropped[centres.index[low]] = True  # nothing else is estimated from these
-    seen = (centres.number > 0) & ~dropped
-    floor = estimate_floor(
-        samples.theta_i[~low], samples.theta_o[~low], fold_azimuth(samples.phi_o[~low]), samples.value[~low]
-    )
+    seen = centres.number > 0
+    floor = estimate_floor(samples.theta_i, samples.theta_o, fold_azimuth(samples.phi_o), samples.value)
     z_sample, at_samples = _sample_logarithm(samples, floor, centres)
     z = centres.mean(z_sample)
 
@@ -101,15 +93,11 @@ def estimate(
     residual, model = _split(centres, z_sample, at_samples, lobe, floor)
 
     say("smoothness")
-    choice = choose_smoothing(centres, residual, weight, dropped)
+    choice = choose_smoothing(centres, residual, weight)
     factor = np.ones(centres.count)
-    left_out = choice.left_out
-    factor[seen] = noise_factors(
-        half[seen], *centres.angles[:2, seen], left_out.residual[seen] / left_out.spread[seen, None]
-    )
-    factor[dropped] = DROPOUT_NOISE
+    factor[seen] = noise_factors(half[seen], *centres.angles[:2, seen], choice.left_out[seen])
     noise = centres.noise(choice.noise) * factor
-    spectra = spectral_filter((model + residual)[seen], left_out.residual[seen])
+    spectra = spectral_filter((model + residual)[seen], choice.left_out[seen])
     if spectra.to_component.size:  # the amplitudes have noise of single wavelengths too
         filtered = spectra(model + residual)
         value = from_log(filtered, log_scale(centres.at, floor))
@@ -125,11 +113,10 @@ def estimate(
     out, variance = _left_out_fifths(seen, lower, dual)
     # a centre's own extra noise, or what averaging took from it, is not that of a new measurement
     spread = np.maximum(variance - noise, 0.0) + choice.noise
-    trusted = np.flatnonzero(~dropped[centres.index])
-    scale = _calibrate(centres, samples, trusted, model + residual - out, spread, floor)
-    out, variance = leave_group_out(lower, dual, np.where(seen, centres.group, -1))
+    scale = _calibrate(centres, samples, model + residual - out, spread, floor)
+    out, variance = leave_group_out(lower, dual, centres.group)
     unsure = np.maximum(variance - noise, 0.0)
-    scale = _calibrate_between(scale, centres, samples, trusted, model + residual - out, unsure, choice.noise, floor)
+    scale = _calibrate_between(scale, centres, samples, model + residual - out, unsure, choice.noise, floor)
     return Estimates(
         wavelength_nm=samples.wavelength_nm,
         floor=floor,
@@ -175,18 +162,18 @@ def _left_out_fifths(seen: np.ndarray, lower: np.ndarray, dual: np.ndarray) -> t
     return leave_group_out(lower, dual, np.where(seen, group, -1))
 
 
-def _calibrate(centres: Centres, samples: RawSamples, trusted, predicted, spread, floor: float) -> ResidualScale:
+def _calibrate(centres: Centres, samples: RawSamples, predicted, spread, floor: float) -> ResidualScale:
     """Calibrate the error scale by how far samples lie from predictions that did not see them."""
-    centre, z, error = _errors_of_predictions(centres, samples, trusted, predicted, floor)
+    centre, z, error = _errors_of_predictions(centres, samples, predicted, floor)
     standardised = error / np.sqrt(spread[centre])[:, None]
     return fit_residual_scale(centres.angles[0, centre], centres.at.half[centre], z, standardised)
 
 
 def _calibrate_between(
-    scale: ResidualScale, centres: Centres, samples: RawSamples, trusted, predicted, unsure, noise: float, floor: float
+    scale: ResidualScale, centres: Centres, samples: RawSamples, predicted, unsure, noise: float, floor: float
 ) -> ResidualScale:
     """Calibrate it between incident angles too, by predictions that did not see a sample's incident angle."""
-    centre, z, error = _errors_of_predictions(centres, samples, trusted, predicted, floor)
+    centre, z, error = _errors_of_predictions(centres, samples, predicted, floor)
     theta_i, half = centres.angles[0, centre], centres.at.half[centre]
     squares = (error / residual_scale(scale, theta_i, half, z)) ** 2 - noise
     ratio = np.maximum(squares, 0.0) / np.maximum(unsure[centre], TINY)[:, None]
@@ -197,9 +184,9 @@ def _calibrate_between(
     return dataclasses.replace(scale, **fit_between_scale(angles, [ratio[rows].ravel() for rows in members]))
 
 
-def _errors_of_predictions(centres: Centres, samples: RawSamples, trusted, predicted, floor: float):
-    """Return the centre of some `trusted` rows, what is predicted there in z, and how far they lie from it in z."""
-    rows = trusted[spread_rows(len(trusted))]
+def _errors_of_predictions(centres: Centres, samples: RawSamples, predicted, floor: float):
+    """Return the centre of some rows, what is predicted there in z, and how far they lie from it in z."""
+    rows = spread_rows(samples.num_samples)
     centre = centres.index[rows]
     z = predicted[centre]
     scale = log_scale(centres.at, floor)[centre]

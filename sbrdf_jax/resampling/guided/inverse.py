@@ -35,22 +35,6 @@ def mirror_lower(lower: np.ndarray) -> np.ndarray:
     return lower + np.tril(lower, -1).T
 
 
-def without(lower: np.ndarray, gone: np.ndarray) -> np.ndarray:
-    """Lower triangle of the inverse for all centres but some, which have nothing to do with each other nor with them.
-
-    Args:
-        lower: Lower triangle of the inverse for all.
-        gone: Mask of the centres to leave out.
-    """
-    rows = np.flatnonzero(gone)
-    across = np.where(np.arange(len(lower))[:, None] >= rows, lower[:, rows], lower[rows].T)
-    with one_blas_thread():
-        left = lower - across @ np.linalg.solve(mirror_lower(lower[np.ix_(rows, rows)]), across.T)
-    left[rows] = left[:, rows] = 0.0
-    left[rows, rows] = 1.0
-    return left
-
-
 def leave_one_out(lower: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Exact leave-one-out residuals [centre, wavelength], (C r)_i / C_ii, and C r.
 

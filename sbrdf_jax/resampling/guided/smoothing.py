@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sbrdf_jax.resampling.guided.centres import Centres
-from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out, without
+from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out
 from sbrdf_jax.resampling.guided.nodes import ModeVariance, Term, mode_variance
 
 CONSTANT = 1e-2  # variance of a constant, relative to the half-angle term's
@@ -25,20 +25,13 @@ NOISE_LADDER = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1, 3e-1)  # noise variance rela
 FIRST_NOISE = 3e-3
 
 
-class LeftOut(NamedTuple):
-    """What is known of directions that are left out, one by one."""
-
-    residual: np.ndarray  # [centre, wavelength]
-    spread: np.ndarray  # [centre] how far they may be off, relative to the median: those far from others are more
-
-
 class Choice(NamedTuple):
     """A noise level, and the curve that led to it: (noise, left-out error) each."""
 
     variance: ModeVariance
     noise: float
     curve: tuple[tuple[float, float], ...]
-    left_out: LeftOut
+    left_out: np.ndarray  # [centre, wavelength] leave-one-out residuals
     reciprocity_cost: float  # left-out error with nodes tied by reciprocity over that without; 1 where not tied
 
 
@@ -48,8 +41,8 @@ def mean_root(residual: np.ndarray) -> float:
 
 
 def left_out_error(
-    centres: Centres, residual: np.ndarray, variance: ModeVariance, noise: float, dropped: np.ndarray
-) -> tuple[float, LeftOut]:
+    centres: Centres, residual: np.ndarray, variance: ModeVariance, noise: float
+) -> tuple[float, np.ndarray]:
     """Geometric mean of the errors of left-out directions and of left-out incident angles, in z.
 
     Args:
@@ -57,38 +50,33 @@ def left_out_error(
         residual: z minus the lobe model's [centre, wavelength].
         variance: The prior.
         noise: Noise variance of one sample.
-        dropped: Mask of the centres that are not to be trusted: they are as if they had not been measured.
 
     Returns:
-        The error, inf where there is none, and what it comes from.
+        The error, inf where there is none, and the leave-one-out residuals [centre, wavelength].
     """
-    seen = (centres.number > 0) & ~dropped
+    seen = centres.number > 0
     lower = centres.lower_inverse(variance, noise)
-    if dropped.any():
-        lower, residual = without(lower, dropped), np.where(dropped[:, None], 0.0, residual)
     out, dual = leave_one_out(lower, residual)
     error = mean_root(out[seen])
     if centres.num_groups > 1:
         error = float(np.sqrt(error * mean_root(leave_group_out(lower, dual, centres.group)[0][seen])))
-    spread = 1 / np.sqrt(np.diag(lower))
-    return error if np.isfinite(error) else np.inf, LeftOut(out, spread / np.median(spread[seen]))
+    return error if np.isfinite(error) else np.inf, out
 
 
-def choose_smoothing(centres: Centres, residual: np.ndarray, noise: float | None, dropped: np.ndarray) -> Choice:
+def choose_smoothing(centres: Centres, residual: np.ndarray, noise: float | None) -> Choice:
     """Choose how smooth the residual is: the noise climbs a ladder while `left_out_error` falls.
 
     Args:
         centres: Where the samples are.
         residual: z minus the lobe model's [centre, wavelength].
         noise: Fixed relative noise variance; None: chosen.
-        dropped: As for `left_out_error`.
     """
     variance = mode_variance(PRIOR, CONSTANT, centres.reciprocal)
-    tried: dict[float, tuple[float, LeftOut]] = {}
+    tried: dict[float, tuple[float, np.ndarray]] = {}
 
     def error(level: float) -> float:
         if level not in tried:
-            tried[level] = left_out_error(centres, residual, variance, level, dropped)
+            tried[level] = left_out_error(centres, residual, variance, level)
         return tried[level][0]
 
     if noise is None:
@@ -101,7 +89,7 @@ def choose_smoothing(centres: Centres, residual: np.ndarray, noise: float | None
     cost = 1.0
     if centres.reciprocal:
         free = mode_variance(PRIOR, CONSTANT)
-        cost = error(noise) / left_out_error(centres, residual, free, noise, dropped)[0]
+        cost = error(noise) / left_out_error(centres, residual, free, noise)[0]
     error(noise)
     curve = tuple((level, found[0]) for level, found in sorted(tried.items()))
     return Choice(variance, noise, curve, tried[noise][1], cost)
