@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+from sbrdf_jax.cleaning import Flag, clean
 from sbrdf_jax.cli import main
-from sbrdf_jax.coverage import cluster_incidences
-from sbrdf_jax.dropouts import find_dropouts
 from sbrdf_jax.evaluation import (
     evaluate,
     evaluate_in_chunks,
@@ -26,7 +25,7 @@ from sbrdf_jax.nnls import ProjectedNewton
 from sbrdf_jax.options import GridOptions, InputOptions, ResampleOptions
 from sbrdf_jax.records import RawSamples, Status
 from sbrdf_jax.report import draw_figures
-from sbrdf_jax.resampling.guided import describe_fit, estimate_whole, fit_field, resample_guided
+from sbrdf_jax.resampling.guided import describe_fit, fit_field, resample_guided
 from sbrdf_jax.resampling.guided.bounds import solve_bounded
 from sbrdf_jax.resampling.guided.centres import place_centres
 from sbrdf_jax.resampling.guided.coordinates import (
@@ -52,15 +51,15 @@ from sbrdf_jax.resampling.guided.error_model import (
     fit_between_scale,
     noise_factors,
 )
-from sbrdf_jax.resampling.guided.estimates import DROPOUT_NOISE
+from sbrdf_jax.resampling.guided.field import evaluate_directions, evaluate_with_error, evaluated_part, field_whitener
 from sbrdf_jax.resampling.guided.field import evaluate_on_axes as field_on_axes
-from sbrdf_jax.resampling.guided.field import evaluate_with_error, evaluated_part, field_whitener
-from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out, lower_inverse, mirror_lower, without
+from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out, lower_inverse, mirror_lower
 from sbrdf_jax.resampling.guided.lobe_fit import fit_lobe_model
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value, lobe_terms
 from sbrdf_jax.resampling.guided.lobe_slopes import lobe_slopes
 from sbrdf_jax.resampling.guided.merging import merge_samples
 from sbrdf_jax.resampling.guided.nodes import GRIDS, interpolate, mirror, mode_variance
+from sbrdf_jax.resampling.guided.shadows import NUM_NEAREST, POWER, measured_value
 from sbrdf_jax.resampling.guided.smoothing import CONSTANT, PRIOR
 from sbrdf_jax.runtime import compile_clock
 from sbrdf_jax.scores import coverage, held_out_scores
@@ -227,35 +226,61 @@ def test_leave_group_out_equals_refits(rng):
     assert not out[group == -1].any()
 
 
-def test_centres_left_out_for_good_are_as_if_they_had_not_been_measured(rng):
-    prior, noise, residual = (np.asarray(a) for a in random_problem(rng))
-    gone = np.zeros(len(noise), bool)
-    gone[[3, 4, 17]] = True
-    lower = np.tril(without(lower_inverse(prior, noise), gone))
-    out, dual = leave_one_out(lower, np.where(gone[:, None], 0.0, residual))
-    few = np.ix_(~gone, ~gone)
-    expected, of_others = leave_one_out(lower_inverse(prior[few], noise[~gone]), residual[~gone])
-    np.testing.assert_allclose(out[~gone], expected, rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(dual[~gone], of_others, rtol=1e-8, atol=1e-8)
-    assert (dual[gone] == 0).all()
-
-
-def test_what_stands_beside_dropouts_is_not_doubted(samples):
+def planted_hole(samples):
+    """A direction of the third incident angle and its nearest, hidden; and the next, to be held out; the samples."""
     angle = np.arccos(np.clip(np.cos(samples.theta_o - 0.4) * np.cos(samples.phi_o - 2.5), -1, 1))
     row = np.flatnonzero(samples.theta_i == np.unique(samples.theta_i)[2])
-    planted = row[np.argsort(angle[row])[:2]]
+    unit = unit_vectors(samples)[row]
+    near = row[np.argsort(np.linalg.norm(unit - unit[np.argmin(angle[row])], axis=1))]
     value = samples.value.copy()
-    value[planted] = 1e-4
-    low = dataclasses.replace(samples, value=value)
-    assert set(np.flatnonzero(find_dropouts(low, cluster_incidences(low.theta_i)[1]))) == set(planted)
-    centres = place_centres(low)
-    estimates, clean = (estimate_whole(each, OPTIONS, centres) for each in (low, samples))
-    hidden = np.zeros(centres.count, bool)
-    hidden[centres.index[planted]] = True
-    assert (estimates.factor[hidden] == DROPOUT_NOISE).all()
-    np.testing.assert_allclose(estimates.factor[~hidden], clean.factor[~hidden], rtol=0.5)
-    assert estimates.noise_level == clean.noise_level
-    assert estimates.floor == pytest.approx(clean.floor, rel=0.1)
+    value[near[:2]] = 1e-4
+    return near[:2], near[2], dataclasses.replace(samples, value=value)
+
+
+def unit_vectors(samples):
+    theta, phi = samples.theta_o, samples.phi_o
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
+
+
+def test_what_stood_in_the_way_is_no_part_of_the_field(samples):
+    hidden, _, low = planted_hole(samples)
+    cleaned = clean(low, method="guided")
+    assert set(np.flatnonzero(cleaned.report.flag & Flag.DROPOUT)) == set(hidden)
+    assert clean(low, method="paper").report.num_kept == samples.num_samples == cleaned.report.num_kept + 2
+    fit, expected = (fit_field(s, OPTIONS) for s in (cleaned.samples, samples.take(np.delete(low.row, hidden))))
+    np.testing.assert_array_equal(fit.field.half, expected.field.half)
+    angles = tuple(a[hidden] for a in (samples.theta_i, samples.theta_o, samples.phi_o))
+    found = np.asarray(evaluate_with_error(evaluated_part(fit.field), fit.whiten, *angles)[0])
+    np.testing.assert_allclose(found, glossy(*angles), rtol=0.1)
+
+
+def test_a_measurement_beside_a_hole_is_predicted_as_it_would_be(samples):
+    """Against sums over all directions of the incident angle: inverse distances of the nearest, in z."""
+    hidden, beside, low = planted_hole(samples)
+    train, held = np.delete(low.row, beside), np.array([beside])
+    cleaned = clean(low.take(train), method="guided")
+    fit = fit_field(cleaned.samples, OPTIONS)
+    others = np.flatnonzero(samples.theta_i != samples.theta_i[beside])[:3]
+    asked = np.concatenate([held, hidden, others])
+    angles = tuple(a[asked] for a in (samples.theta_i, samples.theta_o, samples.phi_o))
+    field = evaluated_part(fit.field)
+    value = evaluate_directions(field, *angles)
+    found = measured_value(field, value, angles, cleaned.samples, low.take(hidden))
+
+    np.testing.assert_array_equal(found[3:], value[3:])  # other incident angles
+    np.testing.assert_allclose(found[1:3], low.value[hidden], rtol=1e-6)  # what was measured there
+    same = np.flatnonzero((samples.theta_i == samples.theta_i[beside]) & (samples.row != beside))
+    unit = unit_vectors(samples)
+    distance = np.linalg.norm(unit[same] - unit[beside], axis=1)
+    nearest = np.argsort(distance)[:NUM_NEAREST]
+    weight = dict(zip(same[nearest].tolist(), distance[nearest] ** -float(POWER), strict=True))
+    scale = log_scale(guided_coordinates(*angles, field.theta_limit), field.floor)
+    z = to_log(value, scale)
+    depth = to_log(low.value[hidden], scale[1:3]) - z[1:3]
+    lowered = sum(weight.get(row, 0.0) * deep for row, deep in zip(hidden.tolist(), depth, strict=True))
+    expected = z[0] + lowered / sum(weight.values())
+    np.testing.assert_allclose(to_log(found[:1], scale[:1])[0], expected, rtol=1e-9)
+    assert (found[0] < 0.9 * value[0]).all()
 
 
 @pytest.mark.parametrize("raised", [0.0, 10.0])  # by 10 the unbounded answer keeps the bound, and nothing is solved

@@ -24,7 +24,7 @@ COVERED = 0.6827
 SORTED_TOGETHER = 256  # residuals whose weights are summed before the sum is looked into
 NO_WEIGHT = 1e-9
 BETWEEN = (0.3, 10.0)  # bounds of what a standard error grows by between measured incident angles
-TABLE_WIDTH = 0.6  # nodes of the table over which residuals are pooled
+TABLE_WIDTH = 0.4  # nodes of the table over which residuals are pooled
 
 
 def estimate_floor(theta_i: np.ndarray, theta_o: np.ndarray, azimuth: np.ndarray, value: np.ndarray) -> float:
@@ -97,7 +97,7 @@ def fit_residual_scale(
     half: np.ndarray,
     z: np.ndarray,
     standardised: np.ndarray,
-    shape: tuple[int, int, int] = (7, 7, 7),
+    shape: tuple[int, int, int] = (9, 7, 7),
 ) -> ResidualScale:
     """Calibrate: the scale below which 68 % of the standardised residuals lie, where they were measured.
 
