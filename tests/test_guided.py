@@ -51,9 +51,23 @@ from sbrdf_jax.resampling.guided.error_model import (
     fit_between_scale,
     noise_factors,
 )
-from sbrdf_jax.resampling.guided.field import evaluate_directions, evaluate_with_error, evaluated_part, field_whitener
+from sbrdf_jax.resampling.guided.field import (
+    evaluate_directions,
+    evaluate_with_error,
+    evaluated_part,
+    field_whitener,
+    unexplained,
+)
 from sbrdf_jax.resampling.guided.field import evaluate_on_axes as field_on_axes
-from sbrdf_jax.resampling.guided.inverse import leave_group_out, leave_one_out, lower_inverse, mirror_lower
+from sbrdf_jax.resampling.guided.inverse import (
+    Whitener,
+    doubted,
+    leave_group_out,
+    leave_one_out,
+    lower_inverse,
+    mirror_lower,
+    whitener,
+)
 from sbrdf_jax.resampling.guided.lobe_fit import fit_lobe_model
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value, lobe_terms
 from sbrdf_jax.resampling.guided.lobe_slopes import lobe_slopes
@@ -224,6 +238,20 @@ def test_leave_group_out_equals_refits(rng):
     spread = matrix[np.ix_(held, held)] - cross @ np.linalg.solve(system, cross.T) + np.diag(np.asarray(noise)[held])
     np.testing.assert_allclose(variance[held], np.diag(spread), rtol=1e-7)
     assert not out[group == -1].any()
+
+
+def test_more_noise_of_a_few_centres_is_as_if_the_whole_had_been_inverted_again(rng):
+    prior, noise, _ = (np.asarray(a) for a in random_problem(rng))
+    extra = np.zeros(len(noise))
+    extra[[3, 4, 17]] = [0.1, 2.0, 1e4]
+    doubt, lower = doubted(np.tril(lower_inverse(prior, noise)), extra)
+    whole = np.linalg.inv(prior + np.diag(noise + extra))
+    np.testing.assert_allclose(np.tril(lower), np.tril(whole), rtol=1e-8, atol=1e-9 * np.abs(whole).max())
+    cross = rng.standard_normal((5, len(noise)))
+    alike = whitener(prior, noise)
+    found = unexplained(cross, np.full(5, 1e6), Whitener(alike, doubt))
+    np.testing.assert_allclose(1e6 - found, np.einsum("dc,ce,de->d", cross, whole, cross), rtol=1e-7, atol=1e-7)
+    assert doubted(lower, np.zeros(len(noise)))[0].shape == (0, len(noise))
 
 
 def planted_hole(samples):

@@ -68,7 +68,7 @@ def forward_errors(problem: HostileProblem, gridded: GriddedBRDF) -> tuple[float
 def condition_number(problem: HostileProblem, method: Method, gridded: GriddedBRDF) -> float:
     """Of the matrix that all wavelengths share: the scaled A'A, or the guided method's prior plus noise."""
     if method == "guided":
-        root = np.linalg.inv(np.asarray(field_whitener(gridded.field)))
+        root = np.linalg.inv(np.asarray(field_whitener(gridded.field).lower))
         seen = np.asarray(gridded.field.noise).reshape(-1) < PADDING_NOISE
         return float(np.linalg.cond((root @ root.T)[np.ix_(seen, seen)]))
     samples = clean(problem.samples, bilateral=True, method=method).samples

@@ -20,6 +20,7 @@ from sbrdf_jax.resampling.guided.coordinates import guided_coordinates
 from sbrdf_jax.resampling.guided.estimates import Estimates, estimate, live_part, live_wavelengths
 from sbrdf_jax.resampling.guided.field import GuidedField
 from sbrdf_jax.resampling.guided.fit import GuidedFit, solve_field
+from sbrdf_jax.resampling.guided.inverse import Whitener
 from sbrdf_jax.resampling.guided.lanes import join_fits, spread, take_fit, with_dead_wavelengths
 from sbrdf_jax.resampling.guided.lobe_model import lobe_terms
 from sbrdf_jax.resampling.guided.reading import read_nodes
@@ -163,7 +164,7 @@ def resample_guided(
     )
 
 
-def fit_of(gridded: GriddedBRDF, whiten: np.ndarray) -> GuidedFit:
+def fit_of(gridded: GriddedBRDF, whiten: Whitener) -> GuidedFit:
     """Return the fit behind a grid: the wavelengths at which it ended as it should."""
     proof = (np.asarray(gridded.kkt_residual), np.asarray(gridded.num_steps), np.asarray(gridded.status))
     fit = GuidedFit(gridded.field, *proof, whiten)

@@ -13,12 +13,13 @@ from sbrdf_jax.records import RawSamples
 from sbrdf_jax.resampling.guided.coordinates import EXTRAPOLATION, Coordinates, guided_coordinates
 from sbrdf_jax.resampling.guided.covariance import (
     GroupedFeatures,
+    HeldCovariances,
     covariance,
     flatten,
     group_coordinates,
     group_features,
 )
-from sbrdf_jax.resampling.guided.inverse import lower_inverse
+from sbrdf_jax.resampling.guided.inverse import lower_product, whitener
 from sbrdf_jax.resampling.guided.merging import merge_samples
 from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, cubic_rows
 
@@ -39,10 +40,10 @@ class Centres:
     theta_limit: np.ndarray  # [2] rad
     features: GroupedFeatures
     reciprocal: bool  # nodes are tied by Helmholtz reciprocity
-    node_covariance: dict[bytes, tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)  # by grid
+    node_covariance: dict[bytes, HeldCovariances] = dataclasses.field(default_factory=dict)  # by grid
     node_flags: dict[bytes, np.ndarray] = dataclasses.field(default_factory=dict)  # `extrapolated_nodes`, by grid
     _prior: dict[int, tuple[ModeVariance, np.ndarray]] = dataclasses.field(default_factory=dict)
-    _inverse: dict[tuple[int, float], np.ndarray] = dataclasses.field(default_factory=dict)
+    _inverse: dict[tuple[int, float], tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
 
     @property
     def count(self) -> int:
@@ -76,11 +77,12 @@ class Centres:
                 self._prior[id(variance)] = variance, covariance(variance, self.snapped, self.features)
         return self._prior[id(variance)][1]
 
-    def lower_inverse(self, variance: ModeVariance, level: float) -> np.ndarray:
-        """Lower triangle of the inverse of prior plus noise, no direction doubted; computed once for each pair."""
+    def inverse(self, variance: ModeVariance, level: float) -> tuple[np.ndarray, np.ndarray]:
+        """Inverse W'W of prior plus noise, no direction doubted, computed once for each pair: W, and its lower half."""
         key = id(variance), level
         if key not in self._inverse:
-            self._inverse[key] = lower_inverse(self.prior(variance), self.noise(level))
+            whiten = whitener(self.prior(variance), self.noise(level))
+            self._inverse[key] = whiten, lower_product(whiten)
         return self._inverse[key]
 
     def noise(self, level: float) -> np.ndarray:

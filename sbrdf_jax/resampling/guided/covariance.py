@@ -10,7 +10,7 @@ reciprocity are the mean of both ways: A becomes (A + A exchanged) / 2.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -45,6 +45,14 @@ class GroupedFeatures:
     half: Any  # [group, member, mode]
     azimuth: Any  # [group, member, mode]
     along: tuple[Any, Any, Any]  # [centre, mode] of each axis of the difference grid
+
+
+class HeldCovariances(NamedTuple):
+    """What the next material of these centres needs at the same nodes."""
+
+    cross: np.ndarray  # [direction, centre] prior covariances
+    prior: np.ndarray  # [direction] prior variances
+    left: list[tuple[np.ndarray, np.ndarray]]  # W, and what centres with equal noise leave of the variances
 
 
 def group_coordinates(angles: Float[AnyArray, "3 group member"], theta_limit: Float[AnyArray, " 2"]) -> Coordinates:

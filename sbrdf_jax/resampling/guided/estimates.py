@@ -24,7 +24,7 @@ from sbrdf_jax.resampling.guided.error_model import (
     spread_rows,
 )
 from sbrdf_jax.resampling.guided.field import GuidedField
-from sbrdf_jax.resampling.guided.inverse import leave_group_out, lower_product, mirror_lower, whitener
+from sbrdf_jax.resampling.guided.inverse import Whitener, doubted, leave_group_out, mirror_lower
 from sbrdf_jax.resampling.guided.lobe_fit import density_weights, fit_amplitudes, fit_lobe_model
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
 from sbrdf_jax.resampling.guided.nodes import ModeVariance
@@ -50,7 +50,7 @@ class Estimates(NamedTuple):
     reciprocity_cost: float
     spectral_filter: SpectralFilter
     scale: ResidualScale
-    whiten: np.ndarray  # [centre, centre] inverse Cholesky factor of prior plus noise
+    whiten: Whitener  # of prior plus noise
     inverse: np.ndarray  # [centre, centre] of prior plus noise
     residual: np.ndarray  # [centre, wavelength] filtered z minus the lobe model's
     model: np.ndarray  # [centre, wavelength] z of the lobe model
@@ -96,7 +96,6 @@ def estimate(
     choice = choose_smoothing(centres, residual, weight)
     factor = np.ones(centres.count)
     factor[seen] = noise_factors(half[seen], *centres.angles[:2, seen], choice.left_out[seen])
-    noise = centres.noise(choice.noise) * factor
     spectra = spectral_filter((model + residual)[seen], choice.left_out[seen])
     if spectra.to_component.size:  # the amplitudes have noise of single wavelengths too
         filtered = spectra(model + residual)
@@ -104,8 +103,7 @@ def estimate(
         lobe, model_residual = fit_amplitudes(lobe.shape, value, filtered, centres.at, density, floor)
         residual, model = _split(centres, z_sample, at_samples, lobe, floor)
     residual = _filtered(spectra, residual, model)
-    whiten = whitener(centres.prior(choice.variance), noise)
-    lower = lower_product(whiten)
+    noise, whiten, lower = _invert(centres, choice.variance, choice.noise, factor)
     inverse = mirror_lower(lower)
 
     say("error scale")
@@ -154,6 +152,14 @@ def _split(centres: Centres, z_sample: np.ndarray, at_samples, lobe: LobeModel, 
 def _filtered(spectra: SpectralFilter, residual: np.ndarray, model: np.ndarray) -> np.ndarray:
     """What the lobe model leaves of the filtered logarithms; both are 0 at centres without samples."""
     return spectra(model + residual) - model
+
+
+def _invert(centres: Centres, variance: ModeVariance, level: float, factor: np.ndarray):
+    """Return the noise [centre], the whitener of prior plus noise, and the lower triangle of its inverse."""
+    whiten, lower = centres.inverse(variance, level)
+    alike = centres.noise(level)
+    doubt, lower = doubted(lower, alike * (factor - 1))
+    return alike * factor, Whitener(whiten, doubt), lower
 
 
 def _left_out_fifths(seen: np.ndarray, lower: np.ndarray, dual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -207,23 +213,23 @@ def restore_estimates(field: GuidedField, samples: RawSamples, centres: Centres)
     residual, model = _split(centres, *_sample_logarithm(samples, floor, centres), lobe, floor)
     spectra = SpectralFilter(field.measured.to_component, field.measured.from_component)
     residual = _filtered(spectra, residual, model)
-    noise = field.noise.reshape(-1)
-    whiten = whitener(centres.prior(field.variance), noise)
+    level, factor = float(field.noise_level), field.noise_factor.reshape(-1)
+    noise, whiten, lower = _invert(centres, field.variance, level, factor)
     return Estimates(
         wavelength_nm=field.measured.wavelength_nm,
         floor=floor,
         lobe=lobe,
         model_residual=field.measured.model_residual,
         variance=field.variance,
-        noise_level=float(field.noise_level),
-        factor=field.noise_factor.reshape(-1),
+        noise_level=level,
+        factor=factor,
         noise=noise,
         curve=tuple(map(tuple, field.curve.T)),
         reciprocity_cost=float(field.reciprocity_cost),
         spectral_filter=spectra,
         scale=field.scale,
         whiten=whiten,
-        inverse=mirror_lower(lower_product(whiten)),
+        inverse=mirror_lower(lower),
         residual=residual,
         model=model,
         node_variance={},

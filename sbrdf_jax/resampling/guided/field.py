@@ -31,7 +31,7 @@ from sbrdf_jax.resampling.guided.covariance import (
     prior_variance,
 )
 from sbrdf_jax.resampling.guided.error_model import ResidualScale, between_scale, residual_scale
-from sbrdf_jax.resampling.guided.inverse import whitener
+from sbrdf_jax.resampling.guided.inverse import Whitener, whitener
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
 from sbrdf_jax.resampling.guided.nodes import (
     GRIDS,
@@ -146,36 +146,53 @@ def each_direction(function: Callable[[Any], Array], directions: Any, num_wavele
     return jax.vmap(function)(directions)
 
 
-def field_whitener(field: GuidedField) -> np.ndarray:
-    """Inverse Cholesky factor [centre, centre] of prior covariance plus noise, which standard errors need."""
+def field_whitener(field: GuidedField) -> Whitener:
+    """Factors of the inverse of prior covariance plus noise, which standard errors need."""
     variance, centre, limit = jax.tree.map(np.asarray, (field.variance, field.centre, field.theta_limit))
     centres = group_coordinates(centre, limit)
     prior = covariance(variance, flatten(centres), group_features(centres))
-    return whitener(prior, np.asarray(field.noise).reshape(-1))
+    whiten = whitener(prior, np.asarray(field.noise).reshape(-1))
+    return Whitener(whiten, np.zeros((0, len(whiten))))
 
 
 def unexplained(
     cross: Float[AnyArray, "direction centre"],
     prior: Float[AnyArray, " direction"],
-    whiten: Float[AnyArray, "centre centre"],
+    whiten: Whitener,
 ) -> Float[AnyArray, " direction"]:
     """Variance that the centres leave in directions, relative to the prior's: the same at every wavelength.
 
     Args:
         cross: Prior covariance of directions and centres.
         prior: Prior variance of the directions.
-        whiten: Inverse Cholesky factor of prior plus noise, from `field_whitener`: lower triangular, so that
-            BLAS multiplies by it as such, and else what is zero is left out block by block.
+        whiten: Of prior plus noise.
     """
-    if array_module(cross, whiten) is np:
+    return with_doubt(prior - explained(cross, whiten.lower), cross, whiten.doubt)
+
+
+def explained(
+    cross: Float[AnyArray, "direction centre"], lower: Float[AnyArray, "centre centre"]
+) -> Float[AnyArray, " direction"]:
+    """Squared length of W c: BLAS multiplies by a triangle as such; else what is zero is left out block by block."""
+    if array_module(cross, lower) is np:
         with one_blas_thread():
-            product = scipy.linalg.blas.dtrmm(1.0, whiten, cross.T, lower=1)
-        return np.maximum(prior - np.einsum("cd,cd->d", product, product), 0.0)
-    count, explained = len(whiten), 0.0
+            product = scipy.linalg.blas.dtrmm(1.0, lower, cross.T, lower=1)
+        return np.einsum("cd,cd->d", product, product)
+    count, total = len(lower), jnp.zeros(len(cross))
     for start in range(0, count, WHITEN_BLOCK):
         end = min(start + WHITEN_BLOCK, count)
-        explained = explained + jnp.sum((cross[:, :end] @ whiten[start:end, :end].T) ** 2, axis=1)
-    return jnp.maximum(prior - explained, 0.0)
+        total = total + jnp.sum((cross[:, :end] @ lower[start:end, :end].T) ** 2, axis=1)
+    return total
+
+
+def with_doubt(
+    left: Float[AnyArray, " direction"],
+    cross: Float[AnyArray, "direction centre"],
+    doubt: Float[AnyArray, "doubted centre"],
+) -> Float[AnyArray, " direction"]:
+    """Variance that is left where some centres have more noise than was reckoned with."""
+    xp = array_module(left, cross, doubt)
+    return xp.maximum(left + xp.sum((cross @ doubt.T) ** 2, axis=1), 0.0)
 
 
 def _errors(field: GuidedField, at: Coordinates, z, variance):
@@ -190,7 +207,7 @@ def _errors(field: GuidedField, at: Coordinates, z, variance):
 @on_host
 def evaluate_with_error(
     field: GuidedField,
-    whiten: Float[AnyArray, "centre centre"],
+    whiten: Whitener,
     theta_i: Float[AnyArray, " direction"],
     theta_o: Float[AnyArray, " direction"],
     phi_o: Float[AnyArray, " direction"],
@@ -203,7 +220,7 @@ def evaluate_with_error(
 
     Args:
         field: The fitted field.
-        whiten: Inverse Cholesky factor of prior plus noise, from `field_whitener`.
+        whiten: Of prior plus noise, from `field_whitener`.
         theta_i: Polar angle of incidence [rad].
         theta_o: Polar angle of exitance [rad].
         phi_o: Azimuth of exitance [rad]; the mirror direction is at pi.

@@ -12,6 +12,7 @@ from sbrdf_jax.resampling.guided.centres import Centres
 from sbrdf_jax.resampling.guided.covariance import node_values
 from sbrdf_jax.resampling.guided.estimates import Estimates
 from sbrdf_jax.resampling.guided.field import GuidedField, WholeSpectrum
+from sbrdf_jax.resampling.guided.inverse import Whitener
 from sbrdf_jax.resampling.guided.nodes import mirror
 
 
@@ -22,7 +23,7 @@ class GuidedFit(NamedTuple):
     kkt_residual: np.ndarray  # [wavelength] relative, of the bounded problem
     num_steps: np.ndarray  # [wavelength]
     status: np.ndarray  # [wavelength] Status
-    whiten: np.ndarray  # [centre, centre] inverse Cholesky factor of prior plus noise, for standard errors
+    whiten: Whitener  # of prior plus noise, for standard errors
 
 
 def solve_field(

@@ -1,10 +1,19 @@
 """The inverse of prior covariance plus noise, on the host, and the closed forms that it gives."""
 
+from typing import Any, NamedTuple
+
 import numpy as np
 import scipy.linalg.blas
 import scipy.linalg.lapack
 
 from sbrdf_jax.host_blas import one_blas_thread
+
+
+class Whitener(NamedTuple):
+    """Factors of the inverse of prior plus noise, W'W - V'V."""
+
+    lower: Any  # W [centre, centre] inverse Cholesky factor, lower triangular, of prior plus equal noise
+    doubt: Any  # V [doubted, centre] what more noise of a few centres takes from it
 
 
 def lower_inverse(prior: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -27,6 +36,26 @@ def lower_product(whiten: np.ndarray) -> np.ndarray:
     """Lower triangle of W'W; what is above is not to be read."""
     with one_blas_thread():
         return scipy.linalg.lapack.dlauum(whiten, lower=1)[0]
+
+
+def doubted(lower: np.ndarray, extra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Give a few centres more noise, by Woodbury's formula: at a cost that grows with how many they are.
+
+    Args:
+        lower: Lower triangle of C, the inverse of prior plus noise.
+        extra: Noise variance that is added [centre].
+
+    Returns:
+        V [doubted, centre], and the lower triangle of the new inverse, C - V'V.
+    """
+    rows = np.flatnonzero(extra)
+    if not len(rows):
+        return np.zeros((0, len(lower))), lower
+    across = np.where(np.arange(len(lower)) >= rows[:, None], lower[:, rows].T, lower[rows])
+    with one_blas_thread():
+        factor = np.linalg.cholesky(np.diag(1 / extra[rows]) + across[:, rows])
+        doubt = scipy.linalg.blas.dtrsm(1.0, factor, across, lower=1)
+        return doubt, scipy.linalg.blas.dsyrk(-1.0, doubt, beta=1.0, c=lower, trans=1, lower=1)
 
 
 def mirror_lower(lower: np.ndarray) -> np.ndarray:

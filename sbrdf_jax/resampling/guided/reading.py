@@ -10,13 +10,16 @@ from sbrdf_jax.angles import SAME_ANGLE
 from sbrdf_jax.devices import on_host
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.records import GriddedBRDF
-from sbrdf_jax.resampling.guided.covariance import covariance_on_axes
+from sbrdf_jax.resampling.guided.covariance import HeldCovariances, covariance_on_axes
 from sbrdf_jax.resampling.guided.field import (
     GuidedField,
     evaluate_on_axes_with_error,
     evaluated_part,
+    explained,
     unexplained,
+    with_doubt,
 )
+from sbrdf_jax.resampling.guided.inverse import Whitener
 from sbrdf_jax.resampling.guided.lanes import take_field
 from sbrdf_jax.resampling.guided.on_axes import on_axes
 
@@ -35,11 +38,11 @@ class NodeValues(NamedTuple):
 def read_nodes(
     field: GuidedField,
     grid: Grid,
-    whiten: np.ndarray,
+    whiten: Whitener,
     node: np.ndarray | None = None,
     known: GriddedBRDF | None = None,
     variances: dict[bytes, np.ndarray] | None = None,
-    covariances: dict[bytes, Covariances] | None = None,
+    covariances: dict[bytes, HeldCovariances] | None = None,
 ) -> NodeValues:
     """Return the field and its standard error at the grid's nodes.
 
@@ -48,7 +51,7 @@ def read_nodes(
     Args:
         field: The fitted field.
         grid: Nodes.
-        whiten: Inverse Cholesky factor of prior plus noise, from the fit.
+        whiten: Of prior plus noise, from the fit.
         node: Mask [theta_i, theta_o, phi_o inclusive] of the nodes that are needed; None: all.
         known: An earlier answer, of which what is needed is taken over.
         variances: Variances of z that other wavelengths have asked for, by grid; new ones are added.
@@ -89,29 +92,39 @@ def _add_variances(
     Covariances depend on angles and the prior alone; of few enough directions they are held for the next material.
     """
     prior = field.variance, field.centre, field.theta_limit
-    pending: list[Covariances] = [covariances[key]] if key in covariances else []
+    pending: list[Covariances] = []
     flushed: list[np.ndarray] = []
     distinct = missing.copy()
     isotropic = (theta_i[:, None] == 0) | (axes[0] == 0)
     distinct[isotropic] = False
     distinct[..., 0] |= isotropic & missing.any(axis=2)
-    rows = [] if pending else np.flatnonzero(distinct.any(axis=(1, 2)))
+    rows = [] if key in covariances else np.flatnonzero(distinct.any(axis=(1, 2)))
     for i in rows:
         pending.append(on_axes(functools.partial(on_host(covariance_on_axes), *prior, theta_i[i]), *axes, distinct[i]))
         if sum(len(part[1]) for part in pending) >= MOST_PENDING:
             flushed.append(unexplained(*_joined(pending), whiten))
             pending = []
-    if pending:
-        cross, prior_alone = _joined(pending)
-        if not flushed:
-            covariances.clear()  # they take up to 52 MB
-            covariances[key] = cross, prior_alone
-        flushed.append(unexplained(cross, prior_alone, whiten))
+    if pending and not flushed:
+        covariances.clear()  # they take up to 52 MB
+        covariances[key] = HeldCovariances(*_joined(pending), [])
+    elif pending:
+        flushed.append(unexplained(*_joined(pending), whiten))
+    if key in covariances:
+        flushed.append(_left(covariances[key], whiten))
     if flushed:
         found = np.full(variance.shape, np.nan)
         found[distinct] = np.concatenate(flushed)
         found[isotropic] = found[isotropic][:, :1]
         variance[missing] = found[missing]
+
+
+def _left(held: HeldCovariances, whiten: Whitener) -> np.ndarray:
+    """`field.unexplained`, of which most is the same for the next material whose noise is as strong."""
+    left = next((found for lower, found in held.left if lower is whiten.lower), None)
+    if left is None:
+        left = held.prior - explained(held.cross, whiten.lower)
+        held.left.append((whiten.lower, left))
+    return with_doubt(left, held.cross, whiten.doubt)
 
 
 def _joined(parts: list[Covariances]) -> Covariances:

@@ -55,7 +55,7 @@ def left_out_error(
         The error, inf where there is none, and the leave-one-out residuals [centre, wavelength].
     """
     seen = centres.number > 0
-    lower = centres.lower_inverse(variance, noise)
+    lower = centres.inverse(variance, noise)[1]
     out, dual = leave_one_out(lower, residual)
     error = mean_root(out[seen])
     if centres.num_groups > 1:
