@@ -14,6 +14,7 @@ import scipy.sparse
 from sbrdf_jax.coverage import SAME_INCIDENCE, cluster_incidences
 from sbrdf_jax.options import GridOptions
 from sbrdf_jax.records import GriddedBRDF, RawSamples
+from sbrdf_jax.schema import angles_with_data
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,11 +156,6 @@ def midpoints(axis) -> np.ndarray:
 def has_data(gridded: GriddedBRDF) -> np.ndarray:
     """Mask [theta_i] of the incident angles with a node that is not beyond the measured range."""
     return angles_with_data(np.asarray(gridded.extrapolated))
-
-
-def angles_with_data(extrapolated: np.ndarray) -> np.ndarray:
-    """`has_data` from `extrapolated` [theta_i, theta_o, phi_o] alone."""
-    return (extrapolated != 2).any(axis=(1, 2))
 
 
 def _quarter_circle(step_deg: float) -> np.ndarray:

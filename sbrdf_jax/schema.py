@@ -5,12 +5,14 @@ import os
 from pathlib import Path
 
 import h5py
+import numpy as np
 
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.hdf5 import attribute, check_texts, shortened
 
 SCHEMA_NAME = "sbrdf-result"
 SCHEMA_VERSION = 1
+MEASURED, INTERPOLATED, BEYOND = 0, 1, 2  # `grid/extrapolated`
 
 
 @contextlib.contextmanager
@@ -37,3 +39,8 @@ def open_result(path: str | os.PathLike):
                 "it was written by a newer sbrdf_jax"
             )
         yield file
+
+
+def angles_with_data(extrapolated: np.ndarray) -> np.ndarray:
+    """Mask [theta_i] of the incident angles that have data, from `extrapolated` [theta_i, theta_o, phi_o]."""
+    return (extrapolated != BEYOND).any(axis=(1, 2))

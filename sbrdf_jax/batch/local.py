@@ -102,8 +102,7 @@ def run_local(materials: Sequence[Material], work: Work, workers: int, tries: in
     try:
         pool.run(min(workers, len(materials)))
     finally:
-        for worker in pool.workers:
-            _stop(worker)
+        _stop(pool.workers)
 
 
 class _Pool:
@@ -209,12 +208,16 @@ def _how(worker: _Worker) -> str:
     return f"signal {-code}" if code < 0 else f"exit code {code}"
 
 
-def _stop(worker: _Worker) -> None:
-    """End a worker: one that waits by its own will, any other at once."""
-    if worker.material is None and worker.ready:
-        with contextlib.suppress(BrokenPipeError):  # it is dead already
-            worker.connection.send(None)
+def _stop(workers: Sequence[_Worker]) -> None:
+    """End workers: those that wait by their own will, all others at once."""
+    for worker in workers:
+        if worker.material is None and worker.ready:
+            with contextlib.suppress(BrokenPipeError):  # it is dead already
+                worker.connection.send(None)
+        else:
+            worker.process.kill()
+    for worker in workers:
         worker.process.join(timeout=5)
-    worker.process.kill()
-    worker.process.join()
-    worker.connection.close()
+        worker.process.kill()
+        worker.process.join()
+        worker.connection.close()

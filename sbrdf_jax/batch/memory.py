@@ -14,10 +14,9 @@ import numpy as np
 
 from sbrdf_jax.config import BUILTIN, config_sha256, parse_config
 from sbrdf_jax.errors import UserError
-from sbrdf_jax.grid import angles_with_data
 from sbrdf_jax.hdf5 import attribute, one_line_errors
 from sbrdf_jax.options import OutputOptions, RunOptions
-from sbrdf_jax.schema import open_result
+from sbrdf_jax.schema import angles_with_data, open_result
 from sbrdf_jax.status import Status
 
 STACKED = ("grid", "spectral", "compact", "metrics")  # groups whose datasets the index stacks over materials

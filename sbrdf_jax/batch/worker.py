@@ -21,7 +21,7 @@ class Work:
 
 
 def serve(connection: Connection, work: Work) -> None:
-    """Say that this process is ready, then answer each material with its outcome, until there is None."""
+    """Say that this process is ready, then answer each material with its outcome, until there is None; end it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends it to the parent too, which decides
     signal.signal(signal.SIGTERM, lambda *_: _end())
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -31,7 +31,8 @@ def serve(connection: Connection, work: Work) -> None:
         while (material := connection.recv()) is not None:
             connection.send(attempt(material, work.compute, memory, retry_failed=work.retry_failed))
     except (EOFError, BrokenPipeError):  # the parent is gone
-        return
+        pass
+    os._exit(0)  # all is written; JAX would take its time to end
 
 
 def _end_with_parent() -> None:

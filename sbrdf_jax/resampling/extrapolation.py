@@ -7,8 +7,8 @@ from sbrdf_jax.angles import fold_azimuth
 from sbrdf_jax.coverage import SAME_INCIDENCE
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.records import RawSamples
+from sbrdf_jax.schema import BEYOND, INTERPOLATED, MEASURED
 
-MEASURED, INTERPOLATED, BEYOND = 0, 1, 2
 WIDEST_AZIMUTH_GAP = np.deg2rad(45.0)  # a gap round the circle wider than this was not measured, not sampled thinly
 
 
