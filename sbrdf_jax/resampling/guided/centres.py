@@ -19,7 +19,7 @@ from sbrdf_jax.resampling.guided.covariance import (
     group_coordinates,
     group_features,
 )
-from sbrdf_jax.resampling.guided.inverse import lower_product, whitener
+from sbrdf_jax.resampling.guided.inverse import Blocks, group_blocks, lower_product, whitener
 from sbrdf_jax.resampling.guided.merging import merge_samples
 from sbrdf_jax.resampling.guided.nodes import GRIDS, ModeVariance, cubic_rows
 
@@ -43,7 +43,7 @@ class Centres:
     node_covariance: dict[bytes, HeldCovariances] = dataclasses.field(default_factory=dict)  # by grid
     node_flags: dict[bytes, np.ndarray] = dataclasses.field(default_factory=dict)  # `extrapolated_nodes`, by grid
     _prior: dict[int, tuple[ModeVariance, np.ndarray]] = dataclasses.field(default_factory=dict)
-    _inverse: dict[tuple[int, float], tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
+    _inverse: dict[tuple[int, float], tuple[np.ndarray, np.ndarray, Blocks]] = dataclasses.field(default_factory=dict)
 
     @property
     def count(self) -> int:
@@ -77,12 +77,17 @@ class Centres:
                 self._prior[id(variance)] = variance, covariance(variance, self.snapped, self.features)
         return self._prior[id(variance)][1]
 
-    def inverse(self, variance: ModeVariance, level: float) -> tuple[np.ndarray, np.ndarray]:
-        """Inverse W'W of prior plus noise, no direction doubted, computed once for each pair: W, and its lower half."""
+    def inverse(self, variance: ModeVariance, level: float) -> tuple[np.ndarray, np.ndarray, Blocks]:
+        """Inverse of prior plus noise, no direction doubted, computed once for each pair.
+
+        Returns:
+            W, of which it is W'W; its lower half; and its blocks of incident angles, inverted.
+        """
         key = id(variance), level
         if key not in self._inverse:
             whiten = whitener(self.prior(variance), self.noise(level))
-            self._inverse[key] = whiten, lower_product(whiten)
+            lower = lower_product(whiten)
+            self._inverse[key] = whiten, lower, group_blocks(lower, self.group)
         return self._inverse[key]
 
     def noise(self, level: float) -> np.ndarray:

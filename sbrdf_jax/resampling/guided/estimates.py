@@ -24,7 +24,7 @@ from sbrdf_jax.resampling.guided.error_model import (
     spread_rows,
 )
 from sbrdf_jax.resampling.guided.field import GuidedField
-from sbrdf_jax.resampling.guided.inverse import Whitener, doubted, leave_group_out, mirror_lower
+from sbrdf_jax.resampling.guided.inverse import Whitener, doubted, group_blocks, leave_group_out, mirror_lower
 from sbrdf_jax.resampling.guided.lobe_fit import density_weights, fit_amplitudes, fit_lobe_model
 from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
 from sbrdf_jax.resampling.guided.nodes import ModeVariance
@@ -112,7 +112,7 @@ def estimate(
     # a centre's own extra noise, or what averaging took from it, is not that of a new measurement
     spread = np.maximum(variance - noise, 0.0) + choice.noise
     scale = _calibrate(centres, samples, model + residual - out, spread, floor)
-    out, variance = leave_group_out(lower, dual, centres.group)
+    out, variance = leave_group_out(group_blocks(lower, centres.group), dual)
     unsure = np.maximum(variance - noise, 0.0)
     scale = _calibrate_between(scale, centres, samples, model + residual - out, unsure, choice.noise, floor)
     return Estimates(
@@ -156,7 +156,7 @@ def _filtered(spectra: SpectralFilter, residual: np.ndarray, model: np.ndarray) 
 
 def _invert(centres: Centres, variance: ModeVariance, level: float, factor: np.ndarray):
     """Return the noise [centre], the whitener of prior plus noise, and the lower triangle of its inverse."""
-    whiten, lower = centres.inverse(variance, level)
+    whiten, lower, _ = centres.inverse(variance, level)
     alike = centres.noise(level)
     doubt, lower = doubted(lower, alike * (factor - 1))
     return alike * factor, Whitener(whiten, doubt), lower
@@ -165,7 +165,7 @@ def _invert(centres: Centres, variance: ModeVariance, level: float, factor: np.n
 def _left_out_fifths(seen: np.ndarray, lower: np.ndarray, dual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Exact residuals of leaving random fifths out, and their variances."""
     group = np.random.default_rng(0).permutation(len(seen)) % CALIBRATION_GROUPS
-    return leave_group_out(lower, dual, np.where(seen, group, -1))
+    return leave_group_out(group_blocks(lower, np.where(seen, group, -1)), dual)
 
 
 def _calibrate(centres: Centres, samples: RawSamples, predicted, spread, floor: float) -> ResidualScale:

@@ -8,6 +8,8 @@ import scipy.linalg.lapack
 
 from sbrdf_jax.host_blas import one_blas_thread
 
+Blocks = list[tuple[np.ndarray, np.ndarray]]
+
 
 class Whitener(NamedTuple):
     """Factors of the inverse of prior plus noise, W'W - V'V."""
@@ -76,18 +78,27 @@ def leave_one_out(lower: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, 
     return dual / np.diag(lower)[:, None], dual
 
 
-def leave_group_out(lower: np.ndarray, dual: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Exact residuals of leaving whole groups out, and their variances: C_gg^-1 (C r)_g, diagonal of C_gg^-1.
+def group_blocks(lower: np.ndarray, group: np.ndarray) -> Blocks:
+    """Rows of each group, and the lower triangle of C_gg^-1.
 
     Args:
         lower: Lower triangle of C, the inverse of prior plus noise.
+        group: Group number per centre; negative ones are in none.
+    """
+    members = [np.flatnonzero(group == number) for number in np.unique(group[group >= 0])]
+    inside = [mirror_lower(lower[np.ix_(rows, rows)]) for rows in members]
+    return [(rows, lower_inverse(block, np.zeros(len(rows)))) for rows, block in zip(members, inside, strict=True)]
+
+
+def leave_group_out(blocks: Blocks, dual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Exact residuals of leaving whole groups out, and their variances: C_gg^-1 (C r)_g, diagonal of C_gg^-1.
+
+    Args:
+        blocks: From `group_blocks`; centres in none are left in always, and get zeros.
         dual: C r [centre, wavelength].
-        group: Group number per centre; negative ones are left in always, and get zeros.
     """
     out, variance = np.zeros_like(dual), np.zeros(len(dual))
-    for number in np.unique(group[group >= 0]):
-        rows = np.flatnonzero(group == number)
-        block = lower_inverse(mirror_lower(lower[np.ix_(rows, rows)]), np.zeros(len(rows)))
+    for rows, block in blocks:
         with one_blas_thread():
             out[rows] = scipy.linalg.blas.dsymm(1.0, block, dual[rows], lower=1)
         variance[rows] = np.diag(block)

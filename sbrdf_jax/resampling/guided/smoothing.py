@@ -55,11 +55,11 @@ def left_out_error(
         The error, inf where there is none, and the leave-one-out residuals [centre, wavelength].
     """
     seen = centres.number > 0
-    lower = centres.inverse(variance, noise)[1]
+    _, lower, blocks = centres.inverse(variance, noise)
     out, dual = leave_one_out(lower, residual)
     error = mean_root(out[seen])
     if centres.num_groups > 1:
-        error = float(np.sqrt(error * mean_root(leave_group_out(lower, dual, centres.group)[0][seen])))
+        error = float(np.sqrt(error * mean_root(leave_group_out(blocks, dual)[0][seen])))
     return error if np.isfinite(error) else np.inf, out
 
 
