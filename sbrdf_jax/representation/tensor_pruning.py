@@ -64,30 +64,32 @@ def _turned(factors: Factors) -> Factors:
 class _Channel(NamedTuple):
     """The cells that a channel has left, and how their inverse matrix differs from that of all cells.
 
-    A lost cell is a pivot of an incomplete Cholesky factorisation of the inverse: with its rows `pivot`,
-    the inverse without the lost cells is the whole one less `pivot.T @ pivot`.
+    A lost cell is a pivot of an incomplete Cholesky factorisation of the inverse: with its columns `pivot`,
+    the inverse without the lost cells is the whole one less `pivot @ pivot.T`.
     """
 
     cells: Int[np.ndarray, " left"]
     value: Float[np.ndarray, " left"]  # of the scaled problem
-    pivot: Float[np.ndarray, "lost left"]
+    pivot: Float[np.ndarray, "left lost"]
 
     def loss(self, inverse: Float[np.ndarray, "cell cell"]) -> Float[np.ndarray, " left"]:
         """By how much the squared error grows without each cell, all others solved anew."""
-        diagonal = np.diag(inverse)[self.cells] - np.einsum("lc,lc->c", self.pivot, self.pivot)
+        diagonal = np.diag(inverse)[self.cells] - np.einsum("cl,cl->c", self.pivot, self.pivot)
         return self.value**2 / diagonal
 
     def without(self, lost: Bool[np.ndarray, " left"], inverse: Float[np.ndarray, "cell cell"]) -> "_Channel":
         """Take cells away and solve for the others anew, by a Schur complement of the inverse."""
         left, lost = np.flatnonzero(~lost), np.flatnonzero(lost)
-        kept, gone = self.pivot.take(left, axis=1), self.pivot.take(lost, axis=1)
+        kept, gone = self.pivot[left], self.pivot[lost]
         if not len(left):
             return _Channel(self.cells[left], self.value[left], kept)
         rows = inverse.take(self.cells[lost], axis=0)
-        root = lower_root(rows.take(self.cells[lost], axis=1) - gone.T @ gone)
+        root = lower_root(rows.take(self.cells[lost], axis=1) - gone @ gone.T)
         solve = functools.partial(scipy.linalg.blas.dtrsm, 1.0, root, lower=1)
-        across, value = solve(rows.take(self.cells[left], axis=1) - gone.T @ kept), solve(self.value[lost, None])
-        return _Channel(self.cells[left], self.value[left] - (value.T @ across)[0], np.concatenate([kept, across]))
+        across, value = solve(rows.take(self.cells[left], axis=1) - gone @ kept.T), solve(self.value[lost, None])
+        return _Channel(
+            self.cells[left], self.value[left] - (value.T @ across)[0], np.concatenate([kept, across.T], axis=1)
+        )
 
 
 class _Thinning:
@@ -96,9 +98,9 @@ class _Thinning:
     def __init__(self, fit: TensorFit, factors: Factors):
         matrix, _, self._scale = fit.core_problem(factors)
         self._factors = factors
-        self._inverse = inverse_of(matrix)
+        self._inverse = inverse_of(matrix).T  # symmetric; rows are taken of it, and lie together here
         values = factors.core.reshape(len(matrix), -1) / self._scale[:, None]
-        self._channels = [_Channel(np.arange(len(matrix)), value, np.zeros((0, len(matrix)))) for value in values.T]
+        self._channels = [_Channel(np.arange(len(matrix)), value, np.zeros((len(matrix), 0))) for value in values.T]
 
     @property
     def count(self) -> int:
