@@ -152,6 +152,38 @@ def test_each_step_is_plain_least_squares(rng):
     for found, wanted in zip(once, by_hand, strict=True):
         np.testing.assert_allclose(found @ np.linalg.pinv(found), wanted @ np.linalg.pinv(wanted), rtol=0, atol=loose)
 
+    some = Factors(u, v, w, np.where(rng.uniform(size=solved.value.shape) < 0.6, solved.value, 0.0))
+    renewed, by_hand = fit.renewed(some), list(some[:3])
+    for mode in range(3):
+
+        def with_given(factor, mode=mode):
+            return model(*[factor if k == mode else f for k, f in enumerate(by_hand)], some.core)
+
+        by_hand[mode] = plain(with_given, by_hand[mode].shape)
+        np.testing.assert_allclose(renewed[mode], by_hand[mode], rtol=0, atol=loose * np.abs(by_hand[mode]).max())
+    assert renewed.core is some.core
+    found, error = fit.solve_cells(some)
+    cells = plain(lambda c: model(u, v, w, np.where(some.core != 0, c, 0.0)), some.core.shape)
+    np.testing.assert_allclose(found.core, cells, rtol=0, atol=loose)
+    left = (weight[..., None] * (value - model(*found)) ** 2).sum()
+    assert abs(error - left) < 1e-3 * fit.energy
+
+
+def test_what_is_pruned_is_fitted_to_the_cells_that_are_left(rng, monkeypatch):
+    at_i, at_o, w = rng.normal(size=(5, 4)), rng.normal(size=(6, 4)), rng.normal(size=(5, 6, 3, 8))
+    gram, moment = w @ np.swapaxes(w, 2, 3), w @ rng.normal(size=(5, 6, 8, 2))
+    fit = TensorFit(Normal(gram, moment, np.full(5, 200.0), at_i, at_o))
+    factors = fit.start()
+    whole = Factors(*factors, fit.solve_core(*factors[:2], fit.project(factors[2])).value)
+    found = prune(fit, whole, 5, None)
+    monkeypatch.setattr("sbrdf_jax.representation.tensor_pruning.POLISHES", 0)
+    bare = prune(fit, whole, 5, None)
+    assert np.count_nonzero(found.core) == np.count_nonzero(bare.core) == 5
+    errors = [fit.solve_cells(each)[1] for each in (found, bare)]
+    assert errors[0] < 0.999 * errors[1]
+    _, least = fit.solve_cells(fit.renewed(found))
+    assert least > 0.97 * errors[0]  # another round hardly gains
+
 
 def test_a_promise_that_settling_would_break_is_kept(rng):
     at_i, at_o, w = rng.normal(size=(5, 4)), rng.normal(size=(6, 4)), rng.normal(size=(5, 6, 3, 8))
@@ -167,7 +199,7 @@ def test_a_promise_that_settling_would_break_is_kept(rng):
         return np.ones(len(gram))
 
     found = grow(fit, lambda a, b, q, c, core: 1, 1e6, is_enough, alike, first_channels=2)
-    assert len(asked) == 3  # the last is pruned once more, and no longer enough
+    assert len(asked) == 4  # the last is pruned once more, then polished, and no longer enough
 
     def value(factors):
         return w.swapaxes(2, 3) @ factors.direction @ fit.amplitudes(factors.theta_i, factors.theta_o, factors.core)

@@ -138,6 +138,19 @@ class TensorFit:
         right = _core_right(at, projection.moment[..., : factors.core.shape[3]])
         return _scaled(_core_matrix(at, at, projection.gram), right)
 
+    def solve_cells(self, factors: Factors) -> tuple[Factors, float]:
+        """Return the best values of the cells that a core has, those that are not 0, and the squared error left."""
+        matrix, right, scale = self.core_problem(factors)
+        old = factors.core.reshape(len(scale), -1)
+        core, gain = np.zeros_like(old), 0.0
+        for channel in range(old.shape[1]):
+            cells = np.flatnonzero(old[:, channel])
+            if len(cells):
+                found = scipy.linalg.solve(matrix[np.ix_(cells, cells)], right[cells, channel], assume_a="pos")
+                gain += found @ (right[cells, channel] + RIDGE * found)
+                core[cells, channel] = found * scale[cells]
+        return factors._replace(core=core.reshape(factors.core.shape)), self.energy - float(gain)
+
     def widened_core(self, solved: SolvedCore, factors, mode: int, wide) -> WidenedCore:
         """Return the best core if one factor has more columns, and by how much each channel lowers the error further.
 
@@ -180,27 +193,44 @@ class TensorFit:
 
     def sweep(self, factors, core, projection: Projection) -> list[np.ndarray]:
         """Renew each factor once, by the channels that `core` has; `projection` is that of the direction's factor."""
-        u, v, w = factors
-        n, channels = self.normal, core.shape[3]
-        gram, moment = projection.gram, projection.moment[..., :channels]
-        a, b, q, c = core.shape
-        part = np.tensordot(n.theta_o @ v, core, (1, 1)).transpose(0, 2, 3, 1)  # [o, q, c, a]
+        u, change = self.orthonormal(0, self._best_theta_i(factors[1], core, projection))
+        core = np.tensordot(change, core, (1, 0))
+        v, change = self.orthonormal(1, self._best_theta_o(u, core, projection))
+        core = np.tensordot(change, core, (1, 1)).transpose(1, 0, 2, 3)
+        return [u, v, self.orthonormal(2, self._best_direction(u, v, core))[0]]
+
+    def renewed(self, factors: Factors) -> Factors:
+        """Renew each factor once, and keep the core as it is."""
+        core, projection = factors.core, self.project(factors.direction)
+        u = self._best_theta_i(factors.theta_o, core, projection)
+        v = self._best_theta_o(u, core, projection)
+        return Factors(u, v, self._best_direction(u, v, core), core)
+
+    def _best_theta_i(self, v, core, projection: Projection):
+        """Return the best factor of theta_i for given others."""
+        gram, moment, a = projection.gram, projection.moment[..., : core.shape[3]], core.shape[0]
+        part = np.tensordot(self.normal.theta_o @ v, core, (1, 1)).transpose(0, 2, 3, 1)  # [o, q, c, a]
         matrix = gram.reshape(len(gram), -1) @ _channel_pairs(part).reshape(-1, a * a)
         right = moment.reshape(len(moment), -1) @ part.reshape(-1, a)
-        u, change = self.orthonormal(0, _solve_mode(n.theta_i, matrix, right))
-        core = np.tensordot(change, core, (1, 0))
-        part = np.tensordot(n.theta_i @ u, core, (1, 0)).transpose(0, 2, 3, 1)  # [i, q, c, b]
-        matrix = np.swapaxes(gram, 0, 1).reshape(gram.shape[1], -1) @ _channel_pairs(part).reshape(-1, b * b)
-        right = np.swapaxes(moment, 0, 1).reshape(moment.shape[1], -1) @ part.reshape(-1, b)
-        v, change = self.orthonormal(1, _solve_mode(n.theta_o, matrix, right))
-        core = np.tensordot(change, core, (1, 1)).transpose(1, 0, 2, 3)
-        part = self.amplitudes(u, v, core)  # [i, o, q, c]
+        return _solve_mode(self.normal.theta_i, matrix, right)
+
+    def _best_theta_o(self, u, core, projection: Projection):
+        """Return the best factor of theta_o for given others."""
+        gram, moment = (np.swapaxes(array, 0, 1) for array in projection)
+        b, moment = core.shape[1], moment[..., : core.shape[3]]
+        part = np.tensordot(self.normal.theta_i @ u, core, (1, 0)).transpose(0, 2, 3, 1)  # [i, q, c, b]
+        matrix = gram.reshape(len(gram), -1) @ _channel_pairs(part).reshape(-1, b * b)
+        right = moment.reshape(len(moment), -1) @ part.reshape(-1, b)
+        return _solve_mode(self.normal.theta_o, matrix, right)
+
+    def _best_direction(self, u, v, core):
+        """Return the best factor of direction for given others."""
+        n, q, part = self.normal, core.shape[2], self.amplitudes(u, v, core)  # [i, o, q, c]
         squares = (part @ np.swapaxes(part, 2, 3)).reshape(-1, q * q)
         size = n.gram.shape[-1]
         matrix = _unpair(n.gram.reshape(-1, size * size).T @ squares, size, q)
-        right = np.tensordot(n.moment[..., :channels], part, ((0, 1, 3), (0, 1, 3)))
-        w, _ = self.orthonormal(2, _solve(matrix, right.reshape(-1, 1))[0].reshape(size, q))
-        return [u, v, w]
+        right = np.tensordot(n.moment[..., : core.shape[3]], part, ((0, 1, 3), (0, 1, 3)))
+        return _solve(matrix, right.reshape(-1, 1))[0].reshape(size, q)
 
     def amplitudes(self, u, v, core) -> Float[np.ndarray, "i o q channel"]:
         """Return what multiplies the directional factor at every pair of polar angles."""
