@@ -1,9 +1,13 @@
-"""How many threads the host's BLAS may take."""
+"""How many threads the host's BLAS may take, and the half of a matrix that it leaves out."""
 
 import contextlib
 import functools
 
+import numpy as np
+from jaxtyping import Float
 from threadpoolctl import ThreadpoolController
+
+TILE = 128  # of a matrix that is mirrored: both sides of it stay in the processor's cache
 
 
 def one_blas_thread() -> contextlib.AbstractContextManager:
@@ -18,3 +22,13 @@ def one_blas_thread() -> contextlib.AbstractContextManager:
 @functools.cache
 def _controller() -> ThreadpoolController:
     return ThreadpoolController()
+
+
+def mirrored(lower: Float[np.ndarray, "row row"]) -> Float[np.ndarray, "row row"]:
+    """Return a symmetric matrix of which the lower triangle is given, in place."""
+    for start in range(0, len(lower), TILE):
+        end = start + TILE
+        lower[start:end, end:] = lower[end:, start:end].T
+        tile = lower[start:end, start:end]
+        tile[:] = np.tril(tile) + np.tril(tile, -1).T
+    return lower

@@ -14,9 +14,10 @@ import numpy as np
 import scipy.linalg.lapack
 from jaxtyping import Float
 
+from sbrdf_jax.host_blas import mirrored
+
 NOTHING = 1e-30  # of the largest diagonal element: a column that has died out, whose unknowns become 0
 WIDER = 6  # columns of a factor for each one more that a step adds to it
-TILE = 128  # of a matrix that is mirrored: both sides of it stay in the processor's cache
 RIDGE = 1e-6  # relative to the diagonal: what no value shows stays small, and directions between run not wild
 
 
@@ -348,13 +349,3 @@ def lower_root(matrix: Float[np.ndarray, "cell cell"]) -> Float[np.ndarray, "cel
     if failed:
         raise np.linalg.LinAlgError("normal equations are not positive definite")
     return root
-
-
-def mirrored(lower: Float[np.ndarray, "cell cell"]) -> Float[np.ndarray, "cell cell"]:
-    """Return a symmetric matrix of which the lower triangle is given, in place."""
-    for start in range(0, len(lower), TILE):
-        end = start + TILE
-        lower[start:end, end:] = lower[end:, start:end].T
-        tile = lower[start:end, start:end]
-        tile[:] = np.tril(tile) + np.tril(tile, -1).T
-    return lower

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg.blas
 import scipy.linalg.lapack
 
-from sbrdf_jax.host_blas import one_blas_thread
+from sbrdf_jax.host_blas import mirrored, one_blas_thread
 
 Blocks = list[tuple[np.ndarray, np.ndarray]]
 
@@ -62,8 +62,7 @@ def doubted(lower: np.ndarray, extra: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def mirror_lower(lower: np.ndarray) -> np.ndarray:
     """Symmetric matrix from its lower triangle; what is above is not read."""
-    lower = np.tril(lower)
-    return lower + np.tril(lower, -1).T
+    return mirrored(np.array(lower))
 
 
 def leave_one_out(lower: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
