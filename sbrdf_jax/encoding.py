@@ -183,10 +183,9 @@ def encode_fft(
     return jnp.concatenate([flat[..., :1], flat[..., 2:]], axis=-1)
 
 
-@jax.jit
 def encode(
-    spectrum: Float[Array | np.ndarray, "*shape wavelength"], basis: SpectralBasis
-) -> Float[Array, "*shape coefficient"]:
+    spectrum: Float[AnyArray, "*shape wavelength"], basis: SpectralBasis
+) -> Float[AnyArray, "*shape coefficient"]:
     """Return the coefficients of spectra in a basis, eq. (12).
 
     Args:
@@ -200,9 +199,18 @@ def encode(
         Where wavelengths are uniform by an FFT, else by least squares as a matrix. A
         NaN spoils the coefficients of its own spectrum only.
     """
-    count = basis.analysis.shape[1]
     if not basis.uniform:
-        return jnp.matmul(spectrum, jnp.asarray(basis.analysis, spectrum.dtype))
+        xp = array_module(spectrum, basis.analysis)
+        return xp.matmul(spectrum, xp.asarray(basis.analysis, spectrum.dtype))
+    return _encode_series(spectrum, basis)
+
+
+@jax.jit
+def _encode_series(
+    spectrum: Float[Array | np.ndarray, "*shape wavelength"], basis: SpectralBasis
+) -> Float[Array, "*shape coefficient"]:
+    """`encode` at uniform wavelengths."""
+    count = basis.analysis.shape[1]
     if basis.kind == "fourier":
         return encode_fft(spectrum, count)
     # a cosine series is the Fourier series of the even extension: no jump at the ends, no sines

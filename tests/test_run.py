@@ -155,7 +155,8 @@ def test_a_dead_wavelength_has_a_report_and_can_be_read(folder, methods):
     assert list((folder / "reported_report").glob("*.html"))
 
 
-def test_what_a_user_would_not_guess_is_a_warning(folder, capsys):
+def test_what_a_user_would_not_guess_is_a_warning(folder, capsys, monkeypatch):
+    monkeypatch.setattr("sbrdf_jax.representation.lobe_tensor.USELESS", 0.1)  # a smooth field: 25 % with 5 numbers
     samples = scattered_samples(np.random.default_rng(3), [0.0, 30.0, 60.0], 150, 5)
     samples.value[:, 2] *= -1
     samples.value[:] *= 1 + 0.5 * np.sin(samples.phi_o)[:, None]
