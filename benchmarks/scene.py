@@ -147,11 +147,12 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
         figure = new_figure()
         axes = figure.subplots()
         share, seconds = np.array([row["share"] for row in rows]), np.array([row["next"] for row in rows])
-        axes.plot([0, 1], [0, rows[0]["next"]], color=MUTED, linewidth=1, label="in proportion")
+        line = np.geomspace(share.min(), 1, 50)
+        axes.plot(line, line * rows[0]["next"], color=MUTED, linewidth=1, label="in proportion")
         axes.plot(share, seconds, "o", color=BLUE, label="next scene of a material, compiled")
         axes.set_xlabel("share of the nodes x wavelengths that the scene needs")
         axes.set_ylabel("seconds, reading to measuring")
-        axes.set_ylim(bottom=0)
+        axes.set(xscale="log", yscale="log", xlim=(0.007, 3), ylim=(0.05, 3))
         axes.legend(loc="upper left")
         axes.set_title("What a scene costs")
         _label(axes, rows)
@@ -163,7 +164,9 @@ def _label(axes, rows: list[dict[str, Any]]) -> None:
     axes.figure.canvas.draw()
     points = axes.transData.transform([(row["share"], row["next"]) for row in rows])
     taken: list[Any] = []
-    places = [((6, height), "left") for height in (3, -9, 12, -16)] + [((-6, height), "right") for height in (3, -9)]
+    places = [((6, height), "left") for height in (3, -9, 12, -16, -26, 22)] + [
+        ((-6, height), "right") for height in (3, -9)
+    ]
     for row in sorted(rows, key=lambda row: row["share"]):
         for offset, side in places:
             style = {"textcoords": "offset points", "fontsize": 8, "ha": side}
