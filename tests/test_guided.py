@@ -253,6 +253,7 @@ def test_more_noise_of_a_few_centres_is_as_if_the_whole_had_been_inverted_again(
     found = unexplained(cross, np.full(5, 1e6), Whitener(alike, doubt))
     np.testing.assert_allclose(1e6 - found, np.einsum("dc,ce,de->d", cross, whole, cross), rtol=1e-7, atol=1e-7)
     assert doubted(lower, np.zeros(len(noise)))[0].shape == (0, len(noise))
+    assert np.isnan(doubted(np.full_like(prior, np.nan), extra)[0]).all()  # and no exception
 
 
 def planted_hole(samples):

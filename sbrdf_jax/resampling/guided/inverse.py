@@ -48,15 +48,15 @@ def doubted(lower: np.ndarray, extra: np.ndarray) -> tuple[np.ndarray, np.ndarra
         extra: Noise variance that is added [centre].
 
     Returns:
-        V [doubted, centre], and the lower triangle of the new inverse, C - V'V.
+        V [doubted, centre], and the lower triangle of the new inverse, C - V'V; nan where there is none.
     """
     rows = np.flatnonzero(extra)
     if not len(rows):
         return np.zeros((0, len(lower))), lower
     across = np.where(np.arange(len(lower)) >= rows[:, None], lower[:, rows].T, lower[rows])
+    whiten = whitener(across[:, rows], 1 / extra[rows])
     with one_blas_thread():
-        factor = np.linalg.cholesky(np.diag(1 / extra[rows]) + across[:, rows])
-        doubt = scipy.linalg.blas.dtrsm(1.0, factor, across, lower=1)
+        doubt = whiten @ across
         return doubt, scipy.linalg.blas.dsyrk(-1.0, doubt, beta=1.0, c=lower, trans=1, lower=1)
 
 
