@@ -152,7 +152,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
         axes.plot(share, seconds, "o", color=BLUE, label="next scene of a material, compiled")
         axes.set_xlabel("share of the nodes x wavelengths that the scene needs")
         axes.set_ylabel("seconds, reading to measuring")
-        axes.set(xscale="log", yscale="log", xlim=(0.007, 3), ylim=(0.05, 3))
+        axes.set(xscale="log", yscale="log", xlim=(0.7 * share.min(), 3), ylim=(0.3 * seconds.min(), 2 * seconds.max()))
         axes.legend(loc="upper left")
         axes.set_title("What a scene costs")
         _label(axes, rows)

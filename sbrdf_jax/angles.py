@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sbrdf_jax.array_module import AnyArray, array_module
+
 MIRROR_AZIMUTH = np.pi
 SAME_ANGLE = 1e-9  # rad; closer angles are one: degrees in a file and back are not exact
 GRAZING = float(np.radians(85.0))  # beyond it a cosine that divides is that of this angle
@@ -23,10 +25,11 @@ def fold_azimuth(phi):
     return abs((phi + np.pi) % (2 * np.pi) - np.pi)
 
 
-def unit_vector(theta: Float[Array, "*shape"], phi: Float[Array, "*shape"]) -> Float[Array, "*shape 3"]:
+def unit_vector(theta: Float[AnyArray, "*shape"], phi: Float[AnyArray, "*shape"]) -> Float[AnyArray, "*shape 3"]:
     """Return unit vectors of the directions (theta, phi) [rad]."""
-    sin_theta = jnp.sin(theta)
-    return jnp.stack([sin_theta * jnp.cos(phi), sin_theta * jnp.sin(phi), jnp.cos(theta) + 0 * phi], axis=-1)
+    xp = array_module(theta, phi)
+    sin_theta = xp.sin(theta)
+    return xp.stack([sin_theta * xp.cos(phi), sin_theta * xp.sin(phi), xp.cos(theta) + 0 * phi], axis=-1)
 
 
 def angle_between(

@@ -153,10 +153,10 @@ def clean(raw: RawSamples, *, bilateral: bool | Literal["auto"] = "auto", method
         mark(bit, where[wrong.any(axis=1)])
         values[bit] = int(wrong.sum())
     mark(Flag.DUPLICATE, where[_repeated(kept)])
-    low = find_dropouts(kept, cluster_incidences(kept.theta_i)[1])
-    mark(Flag.DROPOUT, where[low])
-    leave_out = low & (method == "guided")
-    kept, where = kept.take(~leave_out), where[~leave_out]
+    mark(Flag.DROPOUT, where[find_dropouts(kept, cluster_incidences(kept.theta_i)[1])])
+    dropped = DROPPED | Flag.DROPOUT if method == "guided" else DROPPED
+    stays = (flag[where] & np.uint16(dropped)) == 0
+    kept, where = kept.take(stays), where[stays]
 
     coverage = find_coverage(kept)
     folded = resolve_bilateral(bilateral, method, coverage)
@@ -164,7 +164,7 @@ def clean(raw: RawSamples, *, bilateral: bool | Literal["auto"] = "auto", method
         mark(Flag.FOLDED, where[(kept.phi_o > np.pi + HALF_TURN_TOLERANCE) & (kept.theta_o > 0)])
     report = CleanReport(
         flag=flag,
-        entries=tuple(_entry(bit, flag, values[bit], raw, method) for bit in ACTION_AND_REASON),
+        entries=tuple(_entry(bit, flag, values[bit], raw, dropped) for bit in ACTION_AND_REASON),
         dead_wavelength_nm=raw.wavelength_nm[dead],
         num_rows=raw.num_samples,
         num_kept=kept.num_samples,
@@ -193,7 +193,7 @@ def _repeated(samples: RawSamples) -> np.ndarray:
     return again
 
 
-def _entry(bit: Flag, flag: np.ndarray, values: int, raw: RawSamples, method: str) -> CleanEntry:
+def _entry(bit: Flag, flag: np.ndarray, values: int, raw: RawSamples, dropped: Flag) -> CleanEntry:
     """Return the line of the table for one flag."""
     rows = np.flatnonzero(flag & np.uint16(bit))
     angles = np.degrees(np.stack([raw.theta_i, raw.theta_o, raw.phi_o], axis=1))
@@ -202,6 +202,5 @@ def _entry(bit: Flag, flag: np.ndarray, values: int, raw: RawSamples, method: st
         for r in rows[:NUM_EXAMPLES]
     )
     action, reason = ACTION_AND_REASON[bit]
-    if bit == Flag.DROPOUT and method == "guided":
-        action = "dropped"
+    action = "dropped" if bit & dropped else action
     return CleanEntry(str(bit.name).lower(), action, len(rows), values, reason, examples)

@@ -24,6 +24,7 @@ from sbrdf_jax.representation import lobe_harmonics, lobe_tensor
 from sbrdf_jax.representation.half_field import HalfField, beside_mirror, cells_between, near_mirror
 from sbrdf_jax.representation.paper import compact_coefficient
 from sbrdf_jax.representation.target import PAPER_DIRECTIONS
+from sbrdf_jax.schema import BEYOND
 
 NUM_RANDOM_DIRECTIONS, RANDOM_PER_THETA_I = 4096, 512
 MOST_NUMBERS = 1 << 23  # of the incident angles that are evaluated together
@@ -113,7 +114,7 @@ def measure_grid(gridded: GriddedBRDF, *, absolute: bool = True, seed: int = 0) 
         "negative_share_grid": share,
         "negative_depth_grid": depth,
         "reciprocity_error": reciprocity,
-        "extrapolated_share": (np.asarray(gridded.extrapolated) == 2).mean(axis=(1, 2)),
+        "extrapolated_share": (np.asarray(gridded.extrapolated) == BEYOND).mean(axis=(1, 2)),
     }
     return value, albedo_warnings(value["albedo"], gridded, "grid") if absolute else []
 

@@ -47,6 +47,7 @@ class HeldOut:
 
 def predict(
     train: RawSamples,
+    dropouts: RawSamples,
     grid: Grid,
     options: ResampleOptions,
     theta_i: Float[np.ndarray, " direction"],
@@ -54,7 +55,6 @@ def predict(
     phi_o: Float[np.ndarray, " direction"],
     report: Callable[[str], None] | None = None,
     centres: Centres | None = None,
-    dropouts: RawSamples | None = None,
 ) -> Prediction:
     """Fit cleaned samples and tell what would be measured in other directions [rad].
 
@@ -62,6 +62,8 @@ def predict(
 
     Args:
         train: Cleaned samples.
+        dropouts: Samples that method guided left out: its field knows nothing of what stood in the way there, but a
+            measurement would.
         grid: The grid of the whole measurement.
         options: Resolved options.
         theta_i: Polar angle of incidence [rad].
@@ -69,16 +71,13 @@ def predict(
         phi_o: Azimuth of exitance [rad].
         report: Told how far it is.
         centres: For method guided, what depends on angles alone.
-        dropouts: For method guided, the samples that cleaning left out: the fitted field knows nothing of what stood
-            in the way there, but a measurement would.
     """
     angles = theta_i, theta_o, phi_o
     if options.method == "guided":
         fit = fit_field(train, options, report, None if centres is None else centres.take(train.row))
         field = evaluated_part(fit.field)
         value, error, noise = map(np.asarray, evaluate_with_error(field, fit.whiten, *angles))
-        hidden = dropouts is not None and dropouts.num_samples > 0
-        shaded = measured_value(field, value, angles, train, dropouts) if hidden else value
+        shaded = measured_value(field, value, angles, train, dropouts)
         return Prediction(shaded, fit.status, np.sqrt(error**2 + noise**2 + (value - shaded) ** 2))
     gridded = resample(train, grid, options, report)
     return Prediction(evaluate_in_chunks(gridded, *angles), np.asarray(gridded.status, int))
@@ -133,7 +132,7 @@ def predict_held_out(
         cleaned = clean(rest, bilateral=bilateral, method=options.method)
         dropouts = rest.take((cleaned.report.flag & np.uint16(Flag.DROPOUT)) > 0)
         angles = np.minimum(raw.theta_i[held_out], top), np.minimum(raw.theta_o[held_out], top), raw.phi_o[held_out]
-        found = predict(cleaned.samples, grid, options, *angles, say, centres, dropouts)
+        found = predict(cleaned.samples, dropouts, grid, options, *angles, say, centres)
         predicted[held_out], status[number] = found.value, found.status
         if found.expected_error is not None:
             expected[held_out] = found.expected_error

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from sbrdf_jax import colour
 from sbrdf_jax.evaluation import evaluate_on_axes
+from sbrdf_jax.grid import has_data
 from sbrdf_jax.metrics import live_wavelengths
 from sbrdf_jax.records import GriddedBRDF
 
@@ -52,7 +53,7 @@ def pick_incidences(gridded: GriddedBRDF) -> list[Picked]:
 
 def has_no_data(gridded: GriddedBRDF, incidence: int) -> bool:
     """Whether every node of an incident angle lies beyond the measured range."""
-    return bool((np.asarray(gridded.extrapolated)[incidence] == 2).all())
+    return not has_data(gridded)[incidence]
 
 
 @dataclasses.dataclass(frozen=True)

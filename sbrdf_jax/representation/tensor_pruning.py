@@ -53,7 +53,7 @@ def prune(fit: TensorFit, factors: Factors, most: int, is_enough: Callable[[Fact
                 break
             found = fewer
         polished = _polished(fit, found)
-        if is_enough is None:
+        if is_enough is None or polished is found:
             return polished
         if not is_enough(polished):  # better for all, not for the worst
             return found

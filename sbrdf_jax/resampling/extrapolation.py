@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import KDTree
 
-from sbrdf_jax.angles import fold_azimuth
+from sbrdf_jax.angles import fold_azimuth, unit_vector
 from sbrdf_jax.coverage import SAME_INCIDENCE
 from sbrdf_jax.grid import Grid
 from sbrdf_jax.records import RawSamples
@@ -32,7 +32,7 @@ def extrapolated_nodes(samples: RawSamples, grid: Grid) -> np.ndarray:
     phi_node = fold_azimuth(grid.phi_o) if grid.bilateral else grid.phi_o
     phi_sample = fold_azimuth(samples.phi_o) if grid.bilateral else samples.phi_o
     theta_o, phi_o = (a.ravel() for a in np.meshgrid(grid.theta_o, phi_node, indexing="ij"))
-    nodes, directions = _unit(theta_o, phi_o), _unit(samples.theta_o, phi_sample)
+    nodes, directions = unit_vector(theta_o, phi_o), unit_vector(samples.theta_o, phi_sample)
     chord = 2 * np.sin((reach + 1e-9) / 2)
     flags = np.full((len(grid.theta_i), len(nodes)), INTERPOLATED, np.uint8)
     for index, angle in enumerate(grid.theta_i):
@@ -49,10 +49,6 @@ def extrapolated_nodes(samples: RawSamples, grid: Grid) -> np.ndarray:
     if grid.interpolate_theta_i:
         flags[outside] = BEYOND
     return flags.reshape(len(grid.theta_i), len(grid.theta_o), -1)
-
-
-def _unit(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
 
 
 def _in_azimuth_gap(phi: np.ndarray, measured: np.ndarray, folded: bool) -> np.ndarray:

@@ -61,7 +61,7 @@ def spread_rows(count: int) -> np.ndarray:
 def noise_factors(half: np.ndarray, theta_i: np.ndarray, theta_o: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """Noise variance of each sample relative to its neighbours', from leave-one-out residuals.
 
-    A sample whose residual is more than `OUTLIER` times what its neighbours show is a glint or a fault.
+    A residual of more than `OUTLIER` times what its neighbours show is a glint or a fault: its weight falls.
 
     Args:
         half: log(theta_h [deg] + 1) [sample].

@@ -296,6 +296,7 @@ def _kept_on_axes(*angles: bytes) -> _OnAxes:
 
 
 def _on_axes(theta_i, theta_o, phi_o, theta_limit) -> _OnAxes:
+    """Work out where all combinations of two axes lie among the nodes."""
     at = coordinates_on_axes(theta_i, theta_o, phi_o, theta_limit)
     xp, grid = array_module(at.half), GRIDS["difference"]
     places = tuple(xp.broadcast_to(x, at.half.shape).reshape(-1) for x in grid.places(at))

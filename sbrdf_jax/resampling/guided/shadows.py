@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
+from sbrdf_jax.angles import unit_vector
 from sbrdf_jax.coverage import cluster_incidences
 from sbrdf_jax.records import RawSamples
 from sbrdf_jax.resampling.guided.coordinates import from_log, guided_coordinates, log_scale, to_log
@@ -34,6 +35,8 @@ def measured_value(
         samples: What it was fitted to.
         dropouts: What was left out.
     """
+    if not dropouts.num_samples:
+        return value
     hidden, seen = (np.stack([s.theta_i, s.theta_o, s.phi_o]) for s in (dropouts, samples))
     asked = np.stack(angles)
     known = np.concatenate([hidden, seen], axis=1)
@@ -57,14 +60,8 @@ def measured_value(
 
 def _interpolate(known: np.ndarray, depth: np.ndarray, asked: np.ndarray) -> np.ndarray:
     """Inverse-distance interpolation of depths [known, wavelength] to other directions [theta_o and phi_o, asked]."""
-    distance, nearest = KDTree(_unit(known)).query(_unit(asked), k=min(NUM_NEAREST, known.shape[1]))
+    distance, nearest = KDTree(unit_vector(*known)).query(unit_vector(*asked), k=min(NUM_NEAREST, known.shape[1]))
     closeness = 1 / np.maximum(distance, SAME_PLACE).reshape(asked.shape[1], -1)
     weight = (closeness / closeness.max(axis=1, keepdims=True)) ** POWER
     weight = weight / weight.sum(axis=1, keepdims=True)
     return np.einsum("an,anw->aw", weight, depth[nearest.reshape(weight.shape)])
-
-
-def _unit(angles: np.ndarray) -> np.ndarray:
-    """Directions as unit vectors [direction, 3] from theta_o and phi_o [2, direction]."""
-    theta, phi = angles
-    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
