@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
+from scipy.interpolate import BSpline, CubicSpline
 from tolerances import GRADIENT, ROUNDING, tolerance
 
 from sbrdf_jax import builtin, store
@@ -301,6 +301,31 @@ def test_midway_between_incident_angles_what_is_broad_stays_and_a_peak_moves_on(
     at_nodes = np.isin(midway.phi_o, PHI)
     error = (midway.brdf[inner] - expected)[:, rows][:, :, at_nodes]
     assert np.linalg.norm(error) < allowed * np.linalg.norm(expected[:, rows][:, :, at_nodes])
+
+
+@pytest.mark.parametrize("broken", [0.0, 0.5], ids=["reciprocal", "not reciprocal"])
+def test_midway_a_row_tells_what_is_known_by_reciprocity_where_rows_agree_on_it(broken):
+    theta_i = np.radians(np.arange(0, 90.1, 30))
+    amber = truth("amber_glass_broad", THETA, THETA, PHI)
+    brdf = amber * np.exp(broken * THETA**2)[:, None, None, None]
+    gridded = grid_of(brdf[::2], theta_i=theta_i)
+    midway = half_field(field_of(gridded), gridded.brdf, gridded).blocks[-1]
+    np.testing.assert_array_equal(midway.theta_o, THETA)
+    found, wanted = midway.brdf[:, :, ::2], brdf[1::2, :, : len(PHI) // 2 + 1]
+    spline = np.exp(CubicSpline(theta_i, np.log(brdf[::2]))(THETA[1::2]))[:, :, : len(PHI) // 2 + 1]
+    off, plain = (np.abs(np.log(value / wanted)).max(axis=(2, 3)) for value in (found, spline))  # [theta_i, theta_o]
+    assert (off < 1.2 * plain).all()
+    if not broken:
+        assert off[:, ::2].max() < ROUND < 0.03 < plain.min()  # rows at those theta_o are known, and say it
+        assert off[:, 1::2].mean() < 0.6 * plain[:, 1::2].mean()
+
+
+def test_midway_no_value_is_greater_than_the_rows_around_it_have(amber):
+    brdf = np.array(amber[0].brdf)
+    brdf[1::2, :, 3:9] = brdf[1::2, :, -9:-3] = 0.0
+    blocks = half_field(field_of(amber[0]), brdf, grid_of(brdf)).blocks
+    most = blocks[0].brdf.max(axis=(1, 2))
+    assert (blocks[-1].brdf.max(axis=(1, 2)) <= np.maximum(most[:-1], most[1:]) * (1 + ROUND)).all()
 
 
 def test_midway_knows_no_dead_incident_angle_and_guesses_nothing_where_they_are_uneven(amber):

@@ -3,16 +3,16 @@
 SciPy's interpolation and images take half a second to import, and few runs need them: functions import them.
 """
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sbrdf_jax.angles import GRAZING, SAME_ANGLE
+from sbrdf_jax.angles import SAME_ANGLE
 from sbrdf_jax.evaluation import evaluate_where
 from sbrdf_jax.grid import has_data, midpoints
 from sbrdf_jax.records import GriddedBRDF, SpectralField
+from sbrdf_jax.representation.midway import between_incident_angles
 
 SKIPPED_WEIGHT = 1e-3  # of a node that no scene needs: it has its neighbour's value, and is not to run wild
 UNKNOWN_WEIGHT = 0.01  # of an incident angle without data: it does not count, but is not to run wild
@@ -20,12 +20,10 @@ BETWEEN_WEIGHT = 0.03  # of the error between the nodes, beside that at them, wh
 MIRROR_WEIGHT = 0.02  # of the error near the mirror direction, closer to it than any node or midpoint but its own
 NEAR_MIRROR = np.array([2 / 3, 1 / 3, 1 / 6, 1 / 12, 1 / 24, 0.0])  # steps of phi_o off the plane of incidence
 GUESS_WEIGHT = 1e-4  # where it is interpolated: enough that nothing runs wild
-MIDWAY_WEIGHT = 0.1  # where it is interpolated between incident angles so far apart that splines alone are a poor guess
-WIDE_GAP = np.radians(15.0)  # so far; below it splines are better by the fourth power of the gap, and this counts less
+WIDE_GAP = np.radians(15.0)  # of incident angles so far apart what is midway counts like a node; below it splines
+# are better by the fourth power of the gap, and it counts less
 RELATIVE_SHARE = 0.03  # of the error relative to each direction's own energy
 RELATIVE_FLOOR = 1e-3  # of the mean energy of a direction
-EARLIER = 0.2  # of what a row adds midway may the next one add, though it happens to add less
-SMOOTH = 1e-3  # of a logarithm: what is as even as that is even
 SMALLEST = 1e-9  # of the largest value; logarithms of less are not taken
 
 
@@ -102,10 +100,9 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
             add(nodes.theta_i, at_o, at_phi, _interpolate_logarithm(nodes, at_o, at_phi), GUESS_WEIGHT * share)
         gaps = np.diff(nodes.theta_i)
         if field.interpolate_theta_i and len(gaps) and np.ptp(gaps) < SAME_ANGLE:
-            phi = np.sort(np.concatenate([nodes.phi_o, mid_phi]))
-            between = _between_incident_angles(nodes, share > 0, phi)
+            between = between_incident_angles(nodes.theta_i, nodes.theta_o, phi_o[:count], _logarithm(nodes), share > 0)
             trust = min(float(gaps[0] / WIDE_GAP), 1.0) ** 8
-            add(midpoints(nodes.theta_i), *between, MIDWAY_WEIGHT * trust * less)
+            add(midpoints(nodes.theta_i), *between, trust * less)
         return HalfField(tuple(blocks), known, asymmetry)
     finite = np.isin(np.asarray(gridded.field.wavelength_nm), np.asarray(field.basis.wavelength_nm))
     cell, beside = cells_between(needed), beside_mirror(needed)
@@ -192,73 +189,3 @@ def _interpolate_logarithm(nodes: Block, theta_o, phi_o):
 
     value = PchipInterpolator(nodes.theta_o, _logarithm(nodes), axis=1)(theta_o)
     return np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))
-
-
-def _between_incident_angles(
-    nodes: Block, usable: Bool[np.ndarray, " i"], phi_o: Float[np.ndarray, " p"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return theta_o, phi_o and values midway between incident angles.
-
-    On one path theta_o stays, as does what is broad: a cubic spline through logarithms. On the other it moves with
-    theta_i, so that a peak that moves with its mirror direction stays one peak: polynomials through up to six
-    logarithms. Of the two, the one that is smoother around a direction counts most.
-    """
-    from scipy.interpolate import CubicSpline, PchipInterpolator
-    from scipy.ndimage import maximum_filter1d
-
-    step = np.diff(nodes.theta_i).mean()
-    inside = nodes.theta_o + step <= nodes.theta_o[-1] + SAME_ANGLE
-    inner = nodes.theta_o[inside] + step / 2  # both paths meet nodes there
-    theta_o = np.unique(np.concatenate([inner, nodes.theta_o[[0, -1]]]))
-    logarithm = _logarithm(nodes)
-    if nodes.theta_i[0] < SAME_ANGLE:  # beyond the normal is the other side, seen from behind
-        logarithm = np.concatenate([logarithm[2:0:-1, :, ::-1], logarithm])
-        usable = np.concatenate([usable[2:0:-1], usable])
-    along = PchipInterpolator(nodes.theta_o, logarithm, axis=1)
-    above = np.arange(len(nodes.theta_i) - 1) + len(logarithm) - len(nodes.theta_i) + 1  # places of the next ones
-    stay = CubicSpline(np.flatnonzero(usable), along(theta_o)[usable])(above - 0.5)  # the first and the last are usable
-    _, rough = _along_path(along, usable, above, theta_o, 0.0, nodes.theta_o[-1])
-    move, uneven = _along_path(along, usable, above, theta_o, step, GRAZING)
-    size = 1 + 2 * round(step / np.diff(nodes.theta_o).mean())
-    rough, uneven = (maximum_filter1d(np.nan_to_num(error), size, axis=1) + SMOOTH for error in (rough, uneven))
-    share = np.where(np.isfinite(move), 1 / (1 + (uneven / rough) ** 4), 0.0)
-    value = np.nan_to_num(stay + share * (np.nan_to_num(move) - stay))  # nan beside what is not usable, and weighs 0
-    return theta_o, phi_o, np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))
-
-
-def _along_path(along, usable, above, theta_o, step: float, last: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return values midway between rows and how far they may be off: what the last of six rows adds, or a share of
-    what the rows before it added; nan where none is.
-
-    Args:
-        along: Rows by theta_o.
-        usable: Which rows hold values.
-        above: The row after each midway one.
-        theta_o: Where the path is midway.
-        step: By how much theta_o moves from row to row.
-        last: Of theta_o on a path.
-    """
-    six = []
-    for number in range(-3, 3):
-        at, row = theta_o + (number + 0.5) * step, above + number
-        held = np.clip(row, 0, len(usable) - 1)
-        value = along(np.clip(at, 0.0, last))[held]
-        value[:, (at < -SAME_ANGLE) | (at > last + SAME_ANGLE)] = np.nan
-        value[(row != held) | ~usable[held]] = np.nan
-        six.append(value)
-    values = np.stack(six)
-    exists, filled = np.isfinite(values), np.nan_to_num(values)
-    value, error = (values[2] + values[3]) / 2, np.abs(values[3] - values[2])
-    for first, end in ((2, 5), (1, 4), (1, 5), (0, 4), (2, 6), (0, 5), (1, 6), (0, 6)):  # the last that exist are best
-        more = exists[first:end].all(axis=0)
-        better = np.tensordot(_midway_weights(first, end), filled[first:end], 1)
-        error = np.where(more, np.maximum(np.abs(better - value), EARLIER * error), error)
-        value = np.where(more, better, value)
-    return value, error.mean(axis=-1, keepdims=True)
-
-
-@functools.cache
-def _midway_weights(first: int, end: int) -> np.ndarray:
-    """Return the weights by which a polynomial through those of six equidistant values is read midway of the six."""
-    position = np.arange(first, end) - 2.5
-    return np.linalg.solve(np.vander(position, increasing=True).T, np.eye(len(position))[0])
