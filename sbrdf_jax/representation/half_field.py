@@ -3,6 +3,7 @@
 SciPy's interpolation and images take half a second to import, and few runs need them: functions import them.
 """
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,8 @@ WIDE_GAP = np.radians(15.0)  # of incident angles so far apart what is midway co
 # are better by the fourth power of the gap, and it counts less
 RELATIVE_SHARE = 0.03  # of the error relative to each direction's own energy
 RELATIVE_FLOOR = 1e-3  # of the mean energy of a direction
+COLOUR_SHARE = 3.0  # of squared errors of lightness, where a colour difference is asked for
+LINEAR_BELOW = (6 / 29) ** 3  # CIE 1976 L*: linear in Y below it, a cube root above
 SMALLEST = 1e-9  # of the largest value; logarithms of less are not taken
 
 
@@ -52,7 +55,13 @@ class HalfField(NamedTuple):
         return self.blocks[0]
 
 
-def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"], gridded: GriddedBRDF | None):
+def half_field(
+    field: SpectralField,
+    brdf: Float[np.ndarray, "i o p wavelength"],
+    gridded: GriddedBRDF | None,
+    *,
+    in_colour: bool = False,
+) -> HalfField:
     """Gather what a lobe tensor is fitted to.
 
     Args:
@@ -60,6 +69,7 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
         brdf: Spectra at the nodes [1/sr].
         gridded: The grid stage: which incident angles have data, and what the field is between
             its nodes where it has a field of its own. Otherwise monotone cubics through logarithms.
+        in_colour: A colour difference is asked for: errors count as an eye sees them.
     """
     theta_i, theta_o, phi_o = (np.asarray(a, np.float64) for a in (field.theta_i, field.theta_o, field.phi_o))
     count = (len(phi_o) + 1) // 2
@@ -84,7 +94,8 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
     share = np.where(known, 1.0, np.where(usable, UNKNOWN_WEIGHT, 0.0))[place]
     weight = np.where(np.arange(count) == count - 1, 1.0, 2.0)  # phi_o = 180 degrees is one node, others have twins
     needed = needed[place]
-    nodes = _block(theta_i[place], theta_o, phi_o[:count], even[place], weight, share, needed)
+    block = functools.partial(_block, in_colour=in_colour)
+    nodes = block(theta_i[place], theta_o, phi_o[:count], even[place], weight, share, needed)
     mid_o, mid_phi = midpoints(theta_o), midpoints(phi_o[:count])
     every_o, near = near_mirror(theta_o, phi_o)
     less = np.minimum(share[:-1], share[1:])
@@ -93,7 +104,7 @@ def half_field(field: SpectralField, brdf: Float[np.ndarray, "i o p wavelength"]
     def add(theta_i, theta_o, phi_o, brdf, share, needed=None) -> None:
         twins = np.where(np.isclose(phi_o, np.pi), 1.0, 2.0)
         needed = np.ones(brdf.shape[:3], bool) if needed is None else needed
-        blocks.append(_block(theta_i, theta_o, phi_o, brdf, twins, share, needed))
+        blocks.append(block(theta_i, theta_o, phi_o, brdf, twins, share, needed))
 
     if gridded is None or gridded.field is None:
         for at_o, at_phi in ((mid_o, mid_phi), (every_o, near)):
@@ -143,11 +154,12 @@ def _evaluate_needed(gridded: GriddedBRDF, theta_i, theta_o, phi_o, needed: Bool
     return value
 
 
-def _block(theta_i, theta_o, phi_o, brdf, twins, share, needed) -> Block:
+def _block(theta_i, theta_o, phi_o, brdf, twins, share, needed, *, in_colour: bool) -> Block:
     """Return a block in which an incident angle weighs `share`, whatever its energy.
 
     Squares of errors count relative to the energy of the incident angle, as in eq. (18), and to
-    a small part relative to the direction's own: the colour of dark directions rests on that.
+    a small part relative to the direction's own: the colour of dark directions rests on that. In
+    colour, they count by the slope of CIE 1976 L* there too.
     """
     energy = _energy(brdf, twins)
     usable = np.isfinite(energy) & (energy > 0) & (share > 0)
@@ -157,6 +169,10 @@ def _block(theta_i, theta_o, phi_o, brdf, twins, share, needed) -> Block:
     each = (clean**2).sum(axis=-1)
     number = (needed * twins).sum(axis=(1, 2))[:, None, None]
     relative = RELATIVE_SHARE / (number * each + RELATIVE_FLOOR * energy)
+    if in_colour:
+        slope = np.maximum(np.pi * clean.mean(axis=-1), LINEAR_BELOW) ** (-2 / 3)  # 1 for the perfect diffuser
+        seen = np.where(needed, slope**2 * each * twins, 0.0).sum(axis=(1, 2))
+        relative += COLOUR_SHARE * slope**2 / np.where(usable, seen, 1.0)[:, None, None]
     weight = np.where(usable, share, 0.0)[:, None, None] * (1 / energy + relative) * twins
     return Block(theta_i, theta_o, phi_o, clean, np.where(needed, weight, SKIPPED_WEIGHT * weight), needed)
 

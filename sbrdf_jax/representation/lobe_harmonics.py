@@ -120,7 +120,7 @@ def represent(
     brdf = np.asarray(
         decode(np.asarray(field.coefficient, np.float64), field.basis) if gridded is None else gridded.brdf
     )
-    half = half_field(field, brdf, gridded)
+    half = half_field(field, brdf, gridded, in_colour=target.in_colour)
     max_degree = DEFAULT_MAX_DEGREE if options.max_degree == "auto" else options.max_degree
     status = np.where(np.isfinite(brdf).all(axis=(1, 2, 3)), int(Status.SKIPPED), int(Status.NONFINITE))
     status = np.where(half.known, int(Status.OK), status)
@@ -186,7 +186,7 @@ class _AngleFits:
         self.twins = np.r_[np.full(len(nodes.phi_o) - 1, 2.0), 1.0]
         self.problem = _problem(half, counts, self.vectors, max_degree)
         self.matching = matching
-        if target.kind == "delta_e" and matching is None:
+        if target.in_colour and matching is None:
             self.matching = colour.colour_matching(np.asarray(field.basis.wavelength_nm))
         self.lobes = self._search(nodes, counts, max_degree)  # [set, i, lobe]
         self._measure()

@@ -92,7 +92,9 @@ def represent(
     brdf = np.asarray(
         decode(np.asarray(field.coefficient, np.float64), field.basis) if gridded is None else gridded.brdf
     )
-    half = half_field(field, brdf, gridded)
+    num_wavelengths = np.size(field.basis.wavelength_nm)
+    target = make_target(options.target, len(theta_i), num_wavelengths, budget)
+    half = half_field(field, brdf, gridded, in_colour=target.in_colour)
     floor = half_angle_floor(float(np.diff(theta_o).min()))
     if half.blocks:
         ends = half.nodes.theta_i[[0, -1]]
@@ -101,9 +103,7 @@ def represent(
     num_rows = len(np.unique(np.concatenate([block.theta_i for block in half.blocks]))) if half.blocks else len(theta_i)
     num_i = min(num_rows, MOST_FUNCTIONS) if field.interpolate_theta_i else len(theta_i)
     functions = num_i, min(len(theta_o), MOST_FUNCTIONS), num_direction_functions(floor, is_field=half.is_field)
-    num_wavelengths = np.size(field.basis.wavelength_nm)
     layout = Layout(len(theta_i), functions, num_wavelengths, field.basis.kind == "data")
-    target = make_target(options.target, len(theta_i), num_wavelengths, budget)
     finite = np.isfinite(brdf).all(axis=3)
     if gridded is not None and gridded.needed is not None:
         finite |= ~np.asarray(gridded.needed)
@@ -166,7 +166,7 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
 
     nodes, counts = half.nodes, half.known[place]
     seen = [_Seen.of(block, rows, columns, floor, size) for block in half.blocks[: 2 if half.is_field else 1]]
-    if "delta_e" in (target.kind, *(stop.kind for stop in target.stops)) and matching is None:
+    if target.in_colour and matching is None:
         matching = colour.colour_matching(np.asarray(field.basis.wavelength_nm))
 
     def value(part: _Seen, factors: Factors) -> np.ndarray:

@@ -25,6 +25,11 @@ class Target(NamedTuple):
         return self.kind in ("ratio", "numbers")
 
     @property
+    def in_colour(self) -> bool:
+        """True where a colour difference is promised, or enough."""
+        return "delta_e" in (self.kind, *(kind for kind, _ in self.enough))
+
+    @property
     def stops(self) -> tuple["Target", ...]:
         """Errors at which to stop, as targets of their own."""
         return tuple(Target(kind, value, float("inf")) for kind, value in self.enough)
