@@ -297,19 +297,19 @@ def _storage_of(group: h5py.Group) -> str:
 def write_basis(
     group: h5py.Group, basis: SpectralBasis, wavelength: h5py.Dataset, storage: str = "float64"
 ) -> h5py.Dataset:
-    """Write the axis of coefficients and, of basis "data", its vectors; the others follow from kind and count."""
+    """Write the axis of coefficients and the vectors of a basis that stores them; others follow from kind and count."""
     names, writer = coefficient_names(basis), _Writer(group, storage)
     coefficient = writer.scale("coefficient", np.arange(len(names)), "1")
     coefficient.attrs["coefficient_order"] = ",".join(names)
-    if basis.kind == "data":
+    if basis.stores_vectors:
         writer.values("spectral_vectors", basis.synthesis, "1", [coefficient, wavelength])
     return coefficient
 
 
 def read_basis(group: h5py.Group, kind: str, wavelength_nm: np.ndarray, count: int) -> SpectralBasis:
-    """Read a spectral basis by its kind and count; its vectors lie in the group if it is "data"."""
-    if kind == "data":
-        return vector_basis(wavelength_nm, read(group, "spectral_vectors", (count, len(wavelength_nm))))
+    """Read a spectral basis by its kind and count; vectors found in a material lie in the group."""
+    if kind in ("data", "log_data"):
+        return vector_basis(wavelength_nm, read(group, "spectral_vectors", (count, len(wavelength_nm))), kind)
     basis = make_basis(wavelength_nm, str(kind), count)
     if np.shape(basis.synthesis)[0] != count:
         raise ValueError(f"{len(wavelength_nm)} wavelengths cannot carry {count} coefficients of basis {kind}")

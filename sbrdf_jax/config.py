@@ -30,7 +30,7 @@ AUTO_RESAMPLE: dict[str, dict[str, Any]] = {
     "guided": {"smoothness_weight": "data", "tolerance": 1e-6},
 }
 AUTO_BASIS = {"paper": "fourier"}  # else data
-AUTO_COEFFICIENTS = {"data": DEFAULT_VECTORS}  # else 19, as in the paper
+AUTO_COEFFICIENTS = {"data": DEFAULT_VECTORS, "log_data": DEFAULT_VECTORS}  # else 19, as in the paper
 AUTO_DEGREE = {"paper": 4}  # else 8
 
 BUILTIN = "builtin:"
@@ -262,6 +262,9 @@ def _problems(options: RunOptions) -> Iterator[tuple[str, str]]:
     encode = resolve(options).encode
     if encode.basis == "fourier" and isinstance(encode.coefficients, int) and encode.coefficients % 2 == 0:
         yield "encode.coefficients", f"found {encode.coefficients}; expected an odd number, because basis is fourier"
+    if encode.basis == "log_data" and options.represent.method in ("paper", "lobe_harmonics"):
+        method = options.represent.method
+        yield "encode.basis", f"found log_data; expected another, because method {method} adds lobes and harmonics up"
     method, weight = options.resample.method, options.resample.smoothness_weight
     if method == "paper" and weight == "data":
         yield (

@@ -15,8 +15,9 @@ from sbrdf_jax.interpolation import spectral_weights
 from sbrdf_jax.options import DEFAULT_VECTORS
 from sbrdf_jax.records import GriddedBRDF, SpectralBasis, SpectralField
 
-BASIS_KINDS = ("fourier", "cosine", "data", "identity")
+BASIS_KINDS = ("fourier", "cosine", "data", "log_data", "identity")
 FEWEST_WAVELENGTHS = 5  # below it a series says less than the samples
+SMALLEST = 1e-9  # of the largest value; logarithms of less are not taken
 UNIFORM_TOLERANCE = 1e-6  # of the step; wavelengths closer to uniform are taken as uniform
 
 
@@ -54,7 +55,7 @@ def coefficients_allowed(num_wavelengths: int, wanted: int, kind: str = "fourier
     if num_wavelengths < FEWEST_WAVELENGTHS:
         text = f"{num_wavelengths} wavelengths are too few for a series: the samples themselves are stored"
         return AllowedBasis("identity", num_wavelengths, text)
-    if kind == "data":
+    if kind in ("data", "log_data"):
         used = min(wanted, num_wavelengths)
         text = f"{used} spectral coefficients in place of {wanted}: there are no more wavelengths"
         return AllowedBasis(kind, used, text if used < wanted and wanted != DEFAULT_VECTORS else None)
@@ -73,7 +74,7 @@ def make_basis(wavelength_nm: Float[np.ndarray, " wavelength"], kind: str, coeff
 
     Args:
         wavelength_nm: Measured wavelengths [nm], increasing; both ends belong to the domain.
-        kind: One of `BASIS_KINDS` but "data", which `data_basis` makes.
+        kind: One of `BASIS_KINDS` but "data" and "log_data", which `data_basis` makes.
         coefficients: Coefficients wanted; `coefficients_allowed` says how many are used, and why.
 
     Returns:
@@ -88,8 +89,8 @@ def make_basis(wavelength_nm: Float[np.ndarray, " wavelength"], kind: str, coeff
     if wavelength_nm.size == 0 or not np.all(step > 0):
         raise ValueError("wavelength_nm: expected one wavelength or more, increasing")
     kind, count, _ = coefficients_allowed(wavelength_nm.size, coefficients, kind)
-    if kind == "data":
-        raise ValueError('basis "data": it follows from a material, by data_basis')
+    if kind in ("data", "log_data"):
+        raise ValueError(f'basis "{kind}": it follows from a material, by data_basis')
     if kind == "identity":
         return SpectralBasis(wavelength_nm, np.eye(count), np.eye(count), kind, uniform=False)
     synthesis = _series(_position(wavelength_nm, wavelength_nm), kind, count, np)
@@ -106,6 +107,7 @@ def data_basis(
     wavelength_nm: Float[np.ndarray, " wavelength"],
     brdf: Float[np.ndarray, "theta_i *direction wavelength"],
     coefficients: int,
+    kind: str = "data",
 ) -> SpectralBasis:
     """Return the leading orthonormal spectra of a material, by singular values, on the host.
 
@@ -115,6 +117,7 @@ def data_basis(
         wavelength_nm: Measured wavelengths [nm], increasing.
         brdf: Spectra [1/sr]; incident angles that are not finite or zero throughout do not count.
         coefficients: Vectors wanted; at most as many as wavelengths.
+        kind: "data", or "log_data" for the spectra of logarithms, each weighing what it does without.
 
     Numerics:
         The sign of each vector is that of its sum, so that equal input gives equal vectors.
@@ -123,8 +126,17 @@ def data_basis(
     energy = np.einsum("idw,idw->i", spectra, spectra)
     counts = np.isfinite(energy) & (energy > 0)
     scaled = spectra[counts] / np.sqrt(energy[counts])[:, None, None]
+    if kind == "log_data":
+        scaled = np.linalg.norm(scaled, axis=2, keepdims=True) * logarithm(spectra[counts])
     vectors = spectral_vectors(scaled.reshape(-1, len(wavelength_nm)))[:coefficients]
-    return vector_basis(wavelength_nm, vectors)
+    return vector_basis(wavelength_nm, vectors, kind)
+
+
+def logarithm(brdf: Float[AnyArray, "*shape wavelength"]) -> Float[AnyArray, "*shape wavelength"]:
+    """Return the logarithm of spectra [log(1/sr)], of nothing less than `SMALLEST` of the largest finite value."""
+    xp = array_module(brdf)
+    largest = xp.max(xp.where(xp.isfinite(brdf), brdf, 0.0), initial=1e-290)
+    return xp.log(xp.maximum(brdf, SMALLEST * largest))
 
 
 def spectral_vectors(spectra: Float[np.ndarray, "row wavelength"]) -> Float[np.ndarray, "vector wavelength"]:
@@ -134,11 +146,23 @@ def spectral_vectors(spectra: Float[np.ndarray, "row wavelength"]) -> Float[np.n
     return vectors * np.where(vectors.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
 
 
+def transform(brdf: Float[AnyArray, "*shape wavelength"], basis: SpectralBasis) -> Float[AnyArray, "*shape wavelength"]:
+    """Return what the functions of a basis add up to: spectra [1/sr], or their logarithm."""
+    return logarithm(brdf) if basis.is_logarithmic else brdf
+
+
+def restore(value: Float[AnyArray, "*shape wavelength"], basis: SpectralBasis) -> Float[AnyArray, "*shape wavelength"]:
+    """Return spectra [1/sr] from what the functions of a basis add up to."""
+    return array_module(value).exp(value) if basis.is_logarithmic else value
+
+
 def vector_basis(
-    wavelength_nm: Float[np.ndarray, " wavelength"], vectors: Float[np.ndarray, "coefficient wavelength"]
+    wavelength_nm: Float[np.ndarray, " wavelength"],
+    vectors: Float[np.ndarray, "coefficient wavelength"],
+    kind: str = "data",
 ) -> SpectralBasis:
-    """Return the basis "data" of orthonormal vectors."""
-    return SpectralBasis(np.asarray(wavelength_nm, np.float64), np.array(vectors.T), np.array(vectors), "data")
+    """Return the basis "data" or "log_data" of orthonormal vectors."""
+    return SpectralBasis(np.asarray(wavelength_nm, np.float64), np.array(vectors.T), np.array(vectors), kind)
 
 
 def coefficient_names(basis: SpectralBasis) -> tuple[str, ...]:
@@ -148,7 +172,7 @@ def coefficient_names(basis: SpectralBasis) -> tuple[str, ...]:
         return tuple(f"{'ab'[k > 0 and k % 2 == 0]}_{(k + 1) // 2}" for k in range(count))
     if basis.kind == "cosine":
         return tuple(f"c_{k}" for k in range(count))
-    if basis.kind == "data":
+    if basis.stores_vectors:
         return tuple(f"v_{k}" for k in range(count))
     return tuple(f"{wavelength:g}nm" for wavelength in np.asarray(basis.wavelength_nm))
 
@@ -193,12 +217,13 @@ def encode(
         basis: From `make_basis`.
 
     Returns:
-        Coefficients [1/sr], in the order of `coefficient_names`.
+        Coefficients [1/sr], in the order of `coefficient_names`; of basis "log_data" those of the logarithm.
 
     Numerics:
         Where wavelengths are uniform by an FFT, else by least squares as a matrix. A
         NaN spoils the coefficients of its own spectrum only.
     """
+    spectrum = transform(spectrum, basis)
     if not basis.uniform:
         xp = array_module(spectrum, basis.analysis)
         return xp.matmul(spectrum, xp.asarray(basis.analysis, spectrum.dtype))
@@ -232,16 +257,17 @@ def decode(
         wavelength_nm: Where [nm]; the measured wavelengths if None. Inside the measured range.
 
     Returns:
-        Values [1/sr]; a truncated series may be negative, and ends with the value it starts with.
+        Values [1/sr]; a truncated series may be negative, and ends with the value it starts with. Of basis
+        "log_data" they are positive.
 
     Numerics:
         Between measured wavelengths a series is itself; samples ("identity") are joined by
-        straight lines, which cannot undershoot, vectors ("data") by C1 cubics. Beyond the range
+        straight lines, which cannot undershoot, vectors by C1 cubics. Beyond the range
         a series repeats or mirrors itself.
     """
     synthesis = basis.synthesis if wavelength_nm is None else _functions_at(wavelength_nm, basis)
     xp = array_module(coefficient, synthesis)
-    return xp.matmul(coefficient, xp.asarray(synthesis, coefficient.dtype))
+    return restore(xp.matmul(coefficient, xp.asarray(synthesis, coefficient.dtype)), basis)
 
 
 def encode_field(gridded: GriddedBRDF, basis: SpectralBasis) -> SpectralField:
@@ -290,7 +316,7 @@ def _functions_at(wavelength_nm, basis):
     """Return the basis' functions at wavelengths, as `synthesis` holds them at the measured ones."""
     xp = array_module(wavelength_nm, basis.wavelength_nm, basis.synthesis)
     measured, count = xp.asarray(basis.wavelength_nm, wavelength_nm.dtype), basis.synthesis.shape[0]
-    if basis.kind == "data":
+    if basis.stores_vectors:
         weights = spectral_weights(wavelength_nm, measured)
         return xp.matmul(xp.asarray(basis.synthesis, weights.dtype), weights.T)
     if basis.kind != "identity":

@@ -122,7 +122,9 @@ def write_field(group: h5py.Group, field: SpectralField, grid: h5py.Group) -> No
         wavelength = scale(group, "wavelength_nm", own_nm, "nm")
     index = write_basis(group, field.basis, wavelength)
     axes = [dataset_of(grid, f"{name}_deg") for name in _ANGLES]
-    written = dataset(group, "coefficients", field.coefficient, "1/sr", [*axes, index])
+    written = dataset(
+        group, "coefficients", field.coefficient, "1" if field.basis.is_logarithmic else "1/sr", [*axes, index]
+    )
     written.attrs["basis"] = field.basis.kind
     written.attrs["coefficient_order"] = ",".join(names)
 

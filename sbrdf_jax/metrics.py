@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from sbrdf_jax import colour
 from sbrdf_jax.angles import angle_between, fold_azimuth
-from sbrdf_jax.encoding import decode
+from sbrdf_jax.encoding import decode, restore, transform
 from sbrdf_jax.evaluation import evaluate_in_chunks, evaluate_where, measured_wavelengths
 from sbrdf_jax.grid import midpoints
 from sbrdf_jax.needs import restrict_theta_i
@@ -262,7 +262,7 @@ def truncation_error(
 ) -> Float[np.ndarray, " theta_i"]:
     """Eq. (18) of spectra against their best approximation in a basis, which least squares finds."""
     columns = np.linalg.qr(np.asarray(basis.synthesis, np.float64).T)[0]
-    rest = brdf - brdf @ columns @ columns.T
+    rest = brdf - restore(transform(brdf, basis) @ columns @ columns.T, basis)
     return relative_error((rest**2).sum(axis=(1, 2, 3)), (brdf**2).sum(axis=(1, 2, 3)))
 
 
@@ -286,7 +286,7 @@ def _slice_split(compact, field, original, i):
 def stored_numbers(compact: CompactBRDF | LobeHarmonics | LobeTensor) -> int:
     """Count all numbers that the `compact` group of a result holds, its axes included.
 
-    The matrices of the spectral basis are not stored but for the vectors of "data": they follow
+    The matrices of the spectral basis are not stored but for the vectors found in a material: they follow
     from kind, wavelengths and count.
     """
     if isinstance(compact, LobeTensor):
@@ -296,7 +296,7 @@ def stored_numbers(compact: CompactBRDF | LobeHarmonics | LobeTensor) -> int:
     fields = ("theta_i", "background", "lobe_kind", "lobe_height", "lobe_width", "critical_angle", "lobe_peak_theta_o")
     held = sum(np.size(getattr(compact, name)) for name in (*fields, "status"))
     num_coefficients, num_harmonics = np.shape(compact.background)[1:]
-    vectors = np.size(compact.basis.synthesis) if compact.basis.kind == "data" else 0
+    vectors = np.size(compact.basis.synthesis) if compact.basis.stores_vectors else 0
     return held + np.size(compact.basis.wavelength_nm) + num_coefficients + num_harmonics + vectors
 
 

@@ -87,11 +87,12 @@ class EncodeOptions:
 
     __pydantic_config__ = _STRICT
 
-    basis: Literal["auto", "fourier", "cosine", "data", "identity"] = "auto"
-    """Functions of wavelength; data: vectors found in the material; auto: fourier for paper, else data."""
+    basis: Literal["auto", "fourier", "cosine", "data", "log_data", "identity"] = "auto"
+    """Functions of wavelength; data: vectors found in the material; log_data: in its logarithm, so that spectra are
+    positive (lobe_tensor alone); auto: fourier for paper, else data."""
     coefficients: Auto | Annotated[int, Ge(1), Le(9999)] = "auto"
-    """Real numbers per spectrum, odd for fourier; auto: 12 for data (of which represent takes as many as pay), else 19.
-    Not used by identity."""
+    """Real numbers per spectrum, odd for fourier; auto: 12 for data and log_data, of which represent takes as many as
+    pay, else 19. Not used by identity."""
 
 
 @dataclass(frozen=True)

@@ -210,11 +210,11 @@ def spectral_basis(gridded: GriddedBRDF, options: EncodeOptions) -> SpectralBasi
     """Return the spectral basis that the options name; that of the data from the incident angles that have any."""
     wavelength_nm, wanted = np.asarray(gridded.wavelength_nm), int(options.coefficients)
     allowed = coefficients_allowed(len(wavelength_nm), wanted, options.basis)
-    if allowed.kind != "data":
+    if allowed.kind not in ("data", "log_data"):
         return make_basis(wavelength_nm, allowed.kind, wanted)
     known = has_data(gridded)
     brdf = np.where(needed_nodes(gridded)[..., None], np.asarray(gridded.brdf), 0.0)
-    return data_basis(wavelength_nm, brdf[known] if known.any() else brdf, allowed.coefficients)
+    return data_basis(wavelength_nm, brdf[known] if known.any() else brdf, allowed.coefficients, allowed.kind)
 
 
 def finite_part(gridded: GriddedBRDF) -> GriddedBRDF:

@@ -104,8 +104,9 @@ class SpectralBasis:
 
     kind "fourier": eq. (11), coefficients a_0, a_1, b_1, a_2, b_2, ...; "cosine": the even
     extension, c_0, c_1, ...; "identity": the samples themselves; "data": orthonormal vectors
-    found in a material, by importance. The measured wavelengths are kept, because they are the
-    domain and, for "identity" and "data", the nodes.
+    found in a material, by importance; "log_data": the same of its logarithm, so that every
+    spectrum is positive. The measured wavelengths are kept, because they are the
+    domain and, but for series, the nodes.
     """
 
     wavelength_nm: Any  # [wavelength]
@@ -113,6 +114,16 @@ class SpectralBasis:
     synthesis: Any  # [coefficient, wavelength]: coefficients @ synthesis = spectrum
     kind: str = "fourier"
     uniform: bool = False  # wavelengths so nearly uniform that a series is encoded by an FFT
+
+    @property
+    def stores_vectors(self) -> bool:
+        """True where the functions are found in a material, and do not follow from kind and count."""
+        return self.kind in ("data", "log_data")
+
+    @property
+    def is_logarithmic(self) -> bool:
+        """True where the functions add up to the logarithm of a spectrum."""
+        return self.kind == "log_data"
 
 
 @pytree(static=("window", "interpolate_theta_i"))

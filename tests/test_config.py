@@ -127,6 +127,11 @@ WRONG_OVERRIDES = [
         "command line: input={path: x",
         "bilateral: found false; expected auto or true, because method guided",
     ),
+    (
+        "{encode: {basis: log_data}, represent: {method: paper}}",
+        "command line: {encode",
+        "log_data",
+    ),
     ("represent.target.numbers=9", "command line: represent.target.numbers=9: found ratio and numbers", "one of"),
 ]
 

@@ -89,6 +89,25 @@ def test_round_trip_and_synthesis_between_wavelengths(kind, count, rng):
         np.testing.assert_allclose(found, expected, rtol=0, atol=TIGHT)
 
 
+def test_vectors_of_the_logarithm_keep_every_spectrum_positive(rng):
+    shapes = rng.normal(size=(2, UNEVEN.size))
+    logarithms = rng.normal(size=(3, 20, 2)) @ shapes - 5
+    spectra = np.exp(logarithms)
+    basis = encoding.data_basis(UNEVEN, spectra, 3, "log_data")
+    weight = np.linalg.norm(spectra, axis=2, keepdims=True) / np.linalg.norm(spectra, axis=(1, 2), keepdims=True)
+    expected = np.linalg.svd((weight * logarithms).reshape(-1, UNEVEN.size))[2][:3]
+    np.testing.assert_allclose(np.abs(expected @ basis.synthesis.T), np.eye(3), rtol=0, atol=1e-7)
+    coefficient = encoding.encode(spectra, basis)  # two shapes and a constant: three vectors hold all
+    np.testing.assert_allclose(encoding.decode(coefficient, basis), spectra, rtol=1e-7)
+    wild = encoding.decode(5 * rng.normal(size=(50, 3)), basis, np.array([400.0, 512.3]))
+    assert (wild > 0).all() and encoding.coefficient_names(basis) == ("v_0", "v_1", "v_2")
+
+    spectra[1, 2], spectra[2, 3, 4] = 0.0, np.nan
+    coefficient = encoding.encode(spectra, basis)
+    assert np.isfinite(np.delete(coefficient.reshape(60, 3), 43, axis=0)).all() and np.isnan(coefficient[2, 3]).all()
+    assert encoding.decode(coefficient[1, 2], basis).max() < 1e-6 * np.nanmax(spectra)
+
+
 def test_a_jump_between_the_ends_rings_in_fourier_and_not_in_cosine():
     ramp = np.linspace(0.0, 1.0, 101)
     error = {}

@@ -18,6 +18,7 @@ from sbrdf_jax.grid import make_grid
 from sbrdf_jax.metrics import compression, error_at_nodes, error_between, on_axes, stored_numbers
 from sbrdf_jax.options import GridOptions, RepresentOptions, ResampleOptions, TargetOptions
 from sbrdf_jax.records import GriddedBRDF, SpectralField, Status
+from sbrdf_jax.representation import half_field as half_field_module
 from sbrdf_jax.representation import represent, represent_with_plan, tensor_growth
 from sbrdf_jax.representation.direction_functions import direction_functions, num_direction_functions
 from sbrdf_jax.representation.half_field import half_field, near_mirror
@@ -435,6 +436,31 @@ def test_targets_are_met_and_the_plan_says_so(amber, target):
     np.testing.assert_array_equal(found.status, [Status.OK] * 6 + [Status.SKIPPED])
 
 
+def test_where_a_colour_difference_is_asked_for_errors_count_by_the_slope_of_lightness(amber):
+    gridded, field, _ = amber
+    brdf = np.array(gridded.brdf)
+    brdf[:, :3] *= 1e-3  # darker than where L* is linear
+    plain, seen = (half_field(field, brdf, grid_of(brdf), in_colour=c).nodes for c in (False, True))
+    more = (seen.weight - plain.weight) / np.where(np.arange(13) == 12, 1.0, 2.0)
+    luminance = np.pi * seen.brdf.mean(axis=-1)
+    lightness = np.where(luminance > (6 / 29) ** 3, np.cbrt(luminance), (29 / 6) ** 2 * luminance / 3 + 4 / 29)
+    step = 1e-6 * luminance
+    beyond = luminance + step
+    slope = np.where(beyond > (6 / 29) ** 3, np.cbrt(beyond), (29 / 6) ** 2 * beyond / 3 + 4 / 29) - lightness
+    squared = (slope / step) ** 2
+    for i in range(len(THETA)):
+        np.testing.assert_allclose(more[i] / more[i].max(), squared[i] / squared[i].max(), rtol=1e-3)
+    assert seen.weight.sum() > 1.5 * plain.weight.sum()
+    sizes = []
+    for share in (0.0, half_field_module.COLOUR_SHARE):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(half_field_module, "COLOUR_SHARE", share)
+            found, plan = represent_with_plan(field, options(delta_e=0.5), gridded)
+        assert plan["is_met"]
+        sizes.append(stored_numbers(found))
+    assert sizes[1] <= sizes[0]
+
+
 @pytest.mark.parametrize("target", [{"error": 1e-9}, {"numbers": 5}], ids=str)
 def test_what_cannot_be_met_is_the_best_and_a_warning(amber, target):
     gridded, field, _ = amber
@@ -451,6 +477,44 @@ def test_other_spectral_bases(amber, kind):
     assert found.basis.kind == kind
     limit = eta_of_truncation(gridded.brdf, field.basis)
     assert (eta(found, gridded)[:-1] < limit[:-1] + 0.05).all()
+
+
+def test_vectors_of_the_logarithm_are_positive_in_every_direction(amber, tmp_path, rng):
+    gridded, _, _ = amber
+    brdf = np.array(gridded.brdf)
+    dark = brdf[1, 2, [3, -4]].copy()
+    brdf[1, 2, [3, -4]] = 0.0  # what a positive form cannot be, and shall not bend for
+    gridded = grid_of(brdf)
+    field = encode_field(gridded, data_basis(WAVELENGTH_NM, brdf, 4, "log_data"))
+    found, plan = represent_with_plan(field, options(numbers=300), gridded)
+    assert found.basis.kind == "log_data" and stored_numbers(found) <= 300 * len(THETA) and plan["is_met"]
+    assert plan["worst"] == pytest.approx(eta(found, gridded).max())
+    assert np.delete(eta(found, gridded), 1).max() < 0.01
+    whole = np.array(brdf)
+    whole[1, 2, [3, -4]] = dark
+    assert eta(found, grid_of(whole)).max() < 0.01
+    angles = rng.uniform(0, 1, (3, 100_000)) * np.array([[np.pi / 2], [np.pi / 2], [2 * np.pi]])
+    value = evaluate_in_chunks(found, *angles)
+    assert value.min() > 0 and np.isfinite(value).all()
+    store.save(tmp_path / "r.h5", store.RunResult(gridded=gridded, field=field, compact=found))
+    again = store.load(tmp_path / "r.h5")
+    for stage, loaded in ((found, again.compact), (field, again.field)):
+        some = [angle[:50] for angle in angles]
+        np.testing.assert_allclose(evaluate_in_chunks(loaded, *some), evaluate_in_chunks(stage, *some), rtol=1e-9)
+    found, plan = represent_with_plan(field, options(delta_e=1.0), gridded)
+    assert plan["is_met"] and found.basis.kind == "log_data"
+    zero = grid_of(np.zeros_like(brdf))
+    dark = represent(encode_field(zero, field.basis), NUMBERS, zero)
+    assert (evaluate_in_chunks(dark, np.array(0.3), THETA, np.array(1.0)) == 0).all()
+
+
+@pytest.mark.parametrize("method", ["paper", "lobe_harmonics"])
+def test_sums_of_lobes_are_not_made_of_logarithms(amber, method):
+    field = encode_field(amber[0], data_basis(WAVELENGTH_NM, amber[0].brdf, 4, "log_data"))
+    with pytest.raises(ValueError, match="log_data"):
+        represent(field, RepresentOptions(method=method), amber[0])
+    plan = represent_with_plan(field, RepresentOptions(method="auto"), amber[0])[1]
+    assert plan["method"] == "lobe_tensor" and "not tried" in plan["tried"]["lobe_harmonics"]
 
 
 def eta_of_truncation(brdf, basis):

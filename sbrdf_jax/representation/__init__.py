@@ -25,6 +25,7 @@ def represent(
 
     Raises:
         UserError: float64 is off in JAX.
+        ValueError: The field's basis is "log_data", and the method is neither `lobe_tensor` nor `auto`.
     """
     return represent_with_plan(field, options, gridded)[0]
 
@@ -44,6 +45,8 @@ def represent_with_plan(
     from sbrdf_jax.representation import auto, lobe_harmonics, lobe_tensor, paper
 
     require_float64()
+    if field.basis.is_logarithmic and options.method in ("paper", "lobe_harmonics"):
+        raise ValueError(f"basis log_data: method {options.method} adds lobes and harmonics up, not logarithms")
     if options.method == "paper":
         compact, plan = paper.represent(field, options)
         return _stored(compact, plan, field, options, gridded, matching, None)

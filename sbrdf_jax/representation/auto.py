@@ -57,6 +57,8 @@ def _ruled_out(
     tensor: LobeTensor, target: Target, plan: dict[str, Any], stored: int, gridded: GriddedBRDF | None
 ) -> str | None:
     """Return why `lobe_harmonics` cannot be better than the lobe tensor, as far as that is known without it."""
+    if tensor.basis.is_logarithmic:
+        return "it adds lobes and harmonics up, not logarithms"
     if gridded is not None and gridded.needed is not None and not np.all(gridded.needed):
         return "it needs whole hemispheres"
     if target.is_size and target.stops:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sbrdf_jax.angles import SAME_ANGLE
+from sbrdf_jax.encoding import logarithm
 from sbrdf_jax.evaluation import evaluate_where
 from sbrdf_jax.grid import has_data, midpoints
 from sbrdf_jax.records import GriddedBRDF, SpectralField
@@ -25,9 +26,9 @@ WIDE_GAP = np.radians(15.0)  # of incident angles so far apart what is midway co
 # are better by the fourth power of the gap, and it counts less
 RELATIVE_SHARE = 0.03  # of the error relative to each direction's own energy
 RELATIVE_FLOOR = 1e-3  # of the mean energy of a direction
+NOTHING = 1e-6  # of the energy of a typical direction: its logarithm does not count
 COLOUR_SHARE = 3.0  # of squared errors of lightness, where a colour difference is asked for
 LINEAR_BELOW = (6 / 29) ** 3  # CIE 1976 L*: linear in Y below it, a cube root above
-SMALLEST = 1e-9  # of the largest value; logarithms of less are not taken
 
 
 class Block(NamedTuple):
@@ -61,6 +62,7 @@ def half_field(
     gridded: GriddedBRDF | None,
     *,
     in_colour: bool = False,
+    in_logarithm: bool = False,
 ) -> HalfField:
     """Gather what a lobe tensor is fitted to.
 
@@ -70,6 +72,7 @@ def half_field(
         gridded: The grid stage: which incident angles have data, and what the field is between
             its nodes where it has a field of its own. Otherwise monotone cubics through logarithms.
         in_colour: A colour difference is asked for: errors count as an eye sees them.
+        in_logarithm: Weights are those of squared errors of logarithms.
     """
     theta_i, theta_o, phi_o = (np.asarray(a, np.float64) for a in (field.theta_i, field.theta_o, field.phi_o))
     count = (len(phi_o) + 1) // 2
@@ -94,7 +97,7 @@ def half_field(
     share = np.where(known, 1.0, np.where(usable, UNKNOWN_WEIGHT, 0.0))[place]
     weight = np.where(np.arange(count) == count - 1, 1.0, 2.0)  # phi_o = 180 degrees is one node, others have twins
     needed = needed[place]
-    block = functools.partial(_block, in_colour=in_colour)
+    block = functools.partial(_block, in_colour=in_colour, in_logarithm=in_logarithm)
     nodes = block(theta_i[place], theta_o, phi_o[:count], even[place], weight, share, needed)
     mid_o, mid_phi = midpoints(theta_o), midpoints(phi_o[:count])
     every_o, near = near_mirror(theta_o, phi_o)
@@ -111,7 +114,9 @@ def half_field(
             add(nodes.theta_i, at_o, at_phi, _interpolate_logarithm(nodes, at_o, at_phi), GUESS_WEIGHT * share)
         gaps = np.diff(nodes.theta_i)
         if field.interpolate_theta_i and len(gaps) and np.ptp(gaps) < SAME_ANGLE:
-            between = between_incident_angles(nodes.theta_i, nodes.theta_o, phi_o[:count], _logarithm(nodes), share > 0)
+            between = between_incident_angles(
+                nodes.theta_i, nodes.theta_o, phi_o[:count], logarithm(nodes.brdf), share > 0
+            )
             trust = min(float(gaps[0] / WIDE_GAP), 1.0) ** 8
             add(midpoints(nodes.theta_i), *between, trust * less)
         return HalfField(tuple(blocks), known, asymmetry)
@@ -154,12 +159,13 @@ def _evaluate_needed(gridded: GriddedBRDF, theta_i, theta_o, phi_o, needed: Bool
     return value
 
 
-def _block(theta_i, theta_o, phi_o, brdf, twins, share, needed, *, in_colour: bool) -> Block:
+def _block(theta_i, theta_o, phi_o, brdf, twins, share, needed, *, in_colour: bool, in_logarithm: bool) -> Block:
     """Return a block in which an incident angle weighs `share`, whatever its energy.
 
     Squares of errors count relative to the energy of the incident angle, as in eq. (18), and to
     a small part relative to the direction's own: the colour of dark directions rests on that. In
-    colour, they count by the slope of CIE 1976 L* there too.
+    colour, they count by the slope of CIE 1976 L* there too. An error of a logarithm counts as
+    that of the value to first order, and relative to the direction's own unless that is nothing.
     """
     energy = _energy(brdf, twins)
     usable = np.isfinite(energy) & (energy > 0) & (share > 0)
@@ -173,7 +179,12 @@ def _block(theta_i, theta_o, phi_o, brdf, twins, share, needed, *, in_colour: bo
         slope = np.maximum(np.pi * clean.mean(axis=-1), LINEAR_BELOW) ** (-2 / 3)  # 1 for the perfect diffuser
         seen = np.where(needed, slope**2 * each * twins, 0.0).sum(axis=(1, 2))
         relative += COLOUR_SHARE * slope**2 / np.where(usable, seen, 1.0)[:, None, None]
-    weight = np.where(usable, share, 0.0)[:, None, None] * (1 / energy + relative) * twins
+    weight = 1 / energy + relative
+    if in_logarithm:
+        typical = np.median(each, axis=(1, 2), keepdims=True)
+        fades = each / np.maximum(each + NOTHING * typical, 1e-300)
+        weight = (weight * each + RELATIVE_SHARE / number * fades) / clean.shape[-1]
+    weight = np.where(usable, share, 0.0)[:, None, None] * weight * twins
     return Block(theta_i, theta_o, phi_o, clean, np.where(needed, weight, SKIPPED_WEIGHT * weight), needed)
 
 
@@ -195,13 +206,9 @@ def _energy(brdf, twins):
     return np.einsum("iopw,iopw,p->i", brdf, brdf, twins)
 
 
-def _logarithm(nodes: Block):
-    return np.log(np.maximum(nodes.brdf, SMALLEST * max(nodes.brdf.max(), 1e-300)))
-
-
 def _interpolate_logarithm(nodes: Block, theta_o, phi_o):
     """Interpolate nodes by monotone cubics through their logarithms: in theta_o, then in phi_o."""
     from scipy.interpolate import PchipInterpolator
 
-    value = PchipInterpolator(nodes.theta_o, _logarithm(nodes), axis=1)(theta_o)
+    value = PchipInterpolator(nodes.theta_o, logarithm(nodes.brdf), axis=1)(theta_o)
     return np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))

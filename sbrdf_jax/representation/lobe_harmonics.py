@@ -51,7 +51,7 @@ class Solution(NamedTuple):
 
 def stored_numbers(compact: LobeHarmonics) -> int:
     """Count all numbers that the `compact` group of a result holds, its axes and statuses included."""
-    stores_vectors, num_wavelengths = compact.basis.kind == "data", np.size(compact.basis.wavelength_nm)
+    stores_vectors, num_wavelengths = compact.basis.stores_vectors, np.size(compact.basis.wavelength_nm)
     fixed = _fixed_numbers(np.size(compact.theta_i), np.asarray(compact.degree), num_wavelengths, stores_vectors)
     return fixed + sum(int(mask.sum()) for mask in stored_harmonics(compact))
 
@@ -79,7 +79,7 @@ def _fixed_numbers(num_theta_i, degree, num_wavelengths, stores_vectors):
 
 def least_numbers(tensor: LobeTensor) -> int:
     """Count what one lobe and a constant at every incident angle that counts takes, beside a lobe tensor of a field."""
-    is_data, coefficients = tensor.basis.kind == "data", len(tensor.basis.synthesis)
+    is_data, coefficients = tensor.basis.stores_vectors, len(tensor.basis.synthesis)
     fitted, count = int(np.sum(np.asarray(tensor.status) == int(Status.OK))), 1 if is_data else coefficients
     num_theta_i, num_wavelengths = np.size(tensor.theta_i), np.size(tensor.basis.wavelength_nm)
     fixed = _fixed_numbers(num_theta_i, np.zeros((fitted, count)), num_wavelengths, is_data)
@@ -134,7 +134,7 @@ def represent(
     to_coefficient = channels_of(field.basis, half)[1] if half.blocks else np.eye(solution.degree.shape[1])
     used = solution.degree.shape[1]
     basis = field.basis
-    if basis.kind == "data":
+    if basis.stores_vectors:
         vectors = channels_of(field.basis, half)[0] if half.blocks else np.asarray(basis.synthesis)
         basis = vector_basis(basis.wavelength_nm, vectors[:used])
     to_coefficient = to_coefficient[:used, :used]
@@ -176,7 +176,7 @@ class _AngleFits:
 
     def __init__(self, field, half, target, max_degree, limits, matching):
         self.target, self.limits = target, limits
-        self.stores_vectors = field.basis.kind == "data"
+        self.stores_vectors = field.basis.stores_vectors
         self.vectors = channels_of(field.basis, half)[0]
         self.num_channels = len(self.vectors)
         self.num_theta_i, self.num_wavelengths = len(np.asarray(field.theta_i)), self.vectors.shape[1]

@@ -35,7 +35,7 @@ def even_harmonics(
 def pad_coefficients(compact: LobeHarmonics) -> LobeHarmonics:
     """Return the same with coefficients of 0 up to a multiple of 8, so that most materials share compiled code."""
     count = np.shape(compact.degree)[1]
-    more = -count % COEFFICIENT_STEP if compact.basis.kind == "data" else 0  # else the config fixes how many
+    more = -count % COEFFICIENT_STEP if compact.basis.stores_vectors else 0  # else the config fixes how many
     if not more:
         return compact
     basis = dataclasses.replace(

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sbrdf_jax import colour
-from sbrdf_jax.encoding import decode, spectral_vectors, vector_basis
+from sbrdf_jax.encoding import decode, restore, spectral_vectors, transform, vector_basis
 from sbrdf_jax.options import ErrorBudget, RepresentOptions
 from sbrdf_jax.records import GriddedBRDF, LobeTensor, SpectralBasis, SpectralField, Status
 from sbrdf_jax.representation.direction_functions import (
@@ -39,7 +39,7 @@ class Layout(NamedTuple):
     num_theta_i: int  # nodes of the grid
     functions: tuple[int, int, int]  # of theta_i, theta_o, direction
     num_wavelengths: int
-    stores_vectors: bool  # basis "data": its vectors are counted
+    stores_vectors: bool  # of the basis; they are counted
 
     def numbers(self, a: int, b: int, q: int, channels: int, core: int) -> int:
         """Count all numbers that the `compact` group holds, its axes and the `core` of a core included."""
@@ -54,7 +54,7 @@ def stored_numbers(tensor: LobeTensor) -> int:
     a, b, q, channels = np.shape(tensor.core)
     factors = tensor.theta_i_factor, tensor.theta_o_factor, tensor.direction_factor
     functions = tuple(len(factor) for factor in factors)
-    num_wavelengths, is_data = np.size(tensor.basis.wavelength_nm), tensor.basis.kind == "data"
+    num_wavelengths, is_data = np.size(tensor.basis.wavelength_nm), tensor.basis.stores_vectors
     return Layout(np.size(tensor.theta_i), functions, num_wavelengths, is_data).numbers(
         a, b, q, channels, stored_cells(tensor.core)
     )
@@ -94,7 +94,7 @@ def represent(
     )
     num_wavelengths = np.size(field.basis.wavelength_nm)
     target = make_target(options.target, len(theta_i), num_wavelengths, budget)
-    half = half_field(field, brdf, gridded, in_colour=target.in_colour)
+    half = half_field(field, brdf, gridded, in_colour=target.in_colour, in_logarithm=field.basis.is_logarithmic)
     floor = half_angle_floor(float(np.diff(theta_o).min()))
     if half.blocks:
         ends = half.nodes.theta_i[[0, -1]]
@@ -103,7 +103,7 @@ def represent(
     num_rows = len(np.unique(np.concatenate([block.theta_i for block in half.blocks]))) if half.blocks else len(theta_i)
     num_i = min(num_rows, MOST_FUNCTIONS) if field.interpolate_theta_i else len(theta_i)
     functions = num_i, min(len(theta_o), MOST_FUNCTIONS), num_direction_functions(floor, is_field=half.is_field)
-    layout = Layout(len(theta_i), functions, num_wavelengths, field.basis.kind == "data")
+    layout = Layout(len(theta_i), functions, num_wavelengths, field.basis.stores_vectors)
     finite = np.isfinite(brdf).all(axis=3)
     if gridded is not None and gridded.needed is not None:
         finite |= ~np.asarray(gridded.needed)
@@ -111,6 +111,7 @@ def represent(
     status = np.where(half.known, int(Status.OK), status)
     basis = field.basis
     if not half.blocks:  # zero or nothing everywhere
+        basis = vector_basis(basis.wavelength_nm, basis.synthesis) if basis.is_logarithmic else basis  # has no zero
         factors, log_scale = Factors(*(np.zeros((n, 1)) for n in functions), _no_core(basis)), np.zeros(num_i)
         achieved = worst = 0.0
     else:
@@ -145,6 +146,8 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
     energy = np.einsum("iopw,iopw->i", half.nodes.brdf, half.nodes.brdf)
     scaled = np.flatnonzero(energy > 0)
     log_energy = np.interp(rows, half.nodes.theta_i[scaled], np.log(energy[scaled]))
+    if field.basis.is_logarithmic:  # a factor is a sum there
+        log_energy = np.zeros(len(rows))
     log_scale = np.linalg.lstsq(at_rows, -0.5 * log_energy)[0]
     scale = np.exp(at_rows @ log_scale)
 
@@ -152,13 +155,13 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
     gram, moment = np.zeros((len(rows), len(columns), size, size)), np.zeros((len(rows), len(columns), size, count))
     total = np.zeros(len(rows))
     for block in half.blocks:
-        o = np.searchsorted(columns, block.theta_o)
+        o, fitted = np.searchsorted(columns, block.theta_o), transform(block.brdf, field.basis)
         for i, angle in enumerate(block.theta_i):
             row = np.searchsorted(rows, angle)
             function = _functions(angle, block.theta_o, block.phi_o, floor, size)
             weight = (block.weight[i] / scale[row] ** 2)[..., None]
             weighted = np.swapaxes(function * weight, 1, 2)
-            value = scale[row] * (block.brdf[i] @ vectors.T)
+            value = scale[row] * (fitted[i] @ vectors.T)
             gram[row, o] += weighted @ function
             moment[row, o] += weighted @ value
             total[row] += (weight * value**2).sum()
@@ -172,7 +175,7 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
     def value(part: _Seen, factors: Factors) -> np.ndarray:
         amplitude = fit.amplitudes(factors.theta_i, factors.theta_o, factors.core)[np.ix_(part.rows, part.columns)]
         value = ((part.function @ factors.direction) @ amplitude) @ vectors[: factors.core.shape[3]]
-        return np.maximum(value / scale[part.rows][:, None, None, None], 0.0)
+        return np.maximum(restore(value / scale[part.rows][:, None, None, None], field.basis), 0.0)
 
     def eta(number: int, factors: Factors) -> np.ndarray:
         """Errors of the needed directions of a block, at each incident angle that counts."""
@@ -213,7 +216,9 @@ def _fit(field: SpectralField, half: HalfField, layout: Layout, target: Target, 
     factors = grow(fit, numbers, share * target.budget, is_enough, errors, first_channels=first)
     achieved, used = measure(target, factors), factors.core.shape[3]
     worst = measure(target._replace(kind="error"), factors) if target.is_size else achieved
-    basis = vector_basis(field.basis.wavelength_nm, vectors[:used]) if layout.stores_vectors else field.basis
+    basis = field.basis
+    if basis.stores_vectors:
+        basis = vector_basis(basis.wavelength_nm, vectors[:used], basis.kind)
     return factors._replace(core=factors.core @ to_coefficient[:used, :used]), log_scale, basis, achieved, worst
 
 
@@ -243,12 +248,14 @@ def _functions(theta_i, theta_o, phi_o, floor, count) -> Float[np.ndarray, "o p 
 def channels_of(basis: SpectralBasis, half: HalfField) -> tuple[np.ndarray, np.ndarray]:
     """Return orthonormal spectra [channel, wavelength], and the matrix from channels to coefficients.
 
-    For "data" the vectors are found anew, between the nodes too: there may be peaks there.
+    Vectors of a material are found anew, between the nodes too: there may be peaks there.
     """
     synthesis = np.asarray(basis.synthesis, np.float64)
-    if basis.kind == "data":
-        rows = [(np.sqrt(b.weight)[..., None] * b.brdf).reshape(-1, synthesis.shape[1]) for b in half.blocks]
-        return spectral_vectors(np.concatenate(rows))[: len(synthesis)], np.eye(len(synthesis))
+    if basis.stores_vectors:
+        rows = [np.sqrt(b.weight)[..., None] * transform(b.brdf, basis) for b in half.blocks]
+        return spectral_vectors(np.concatenate([row.reshape(-1, synthesis.shape[1]) for row in rows]))[
+            : len(synthesis)
+        ], np.eye(len(synthesis))
     columns, triangle = np.linalg.qr(synthesis.T)
     return columns.T, np.linalg.inv(triangle).T
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from sbrdf_jax.encoding import vector_basis
 from sbrdf_jax.records import CompactBRDF, LobeHarmonics, LobeTensor
 
-VALUES = {  # what is rounded, by record; the vectors of a basis "data" are too
+VALUES = {  # what is rounded, by record; the vectors of a basis that stores them are too
     CompactBRDF: ("background", "lobe_height"),
     LobeHarmonics: ("background", "lobe_height"),
     LobeTensor: ("theta_i_factor", "theta_o_factor", "direction_factor", "core"),
@@ -66,8 +66,8 @@ def round_form(
     parts = {name: rounded(name, getattr(compact, name)) for name in VALUES[type(compact)]}
     parts |= {name: _as_float32(getattr(compact, name)) for name in PRECISE[type(compact)]}
     basis = compact.basis
-    if basis.kind == "data":
-        basis = vector_basis(basis.wavelength_nm, rounded("spectral_vectors", basis.synthesis))
+    if basis.stores_vectors:
+        basis = vector_basis(basis.wavelength_nm, rounded("spectral_vectors", basis.synthesis), basis.kind)
     return dataclasses.replace(compact, storage=storage, basis=basis, **parts)
 
 

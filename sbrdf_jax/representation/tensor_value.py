@@ -17,7 +17,7 @@ RANK_STEP = 8
 def pad_ranks(tensor: LobeTensor) -> LobeTensor:
     """Return the same tensor with zeros up to ranks of a multiple of 8, so that most tensors share compiled code."""
     more = [-rank % RANK_STEP for rank in tensor.core.shape]
-    if tensor.basis.kind != "data":
+    if not tensor.basis.stores_vectors:
         more[3] = 0  # the config fixes how many
     if not any(more):
         return tensor
