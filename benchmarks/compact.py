@@ -23,7 +23,11 @@ from benchmarks.solver import CORNELL
 GLASSES = ("amber_glass", "amber_glass_sharp", "amber_glass_broad")
 DEFAULT = ("amber_glass", "garnet_red", "cayman")
 SIZES = (64, 107, 214, 513)
-FORMS = {"lobe_tensor": (SIZES, (0.045, 0.01)), "lobe_harmonics": (SIZES[1:], (0.045,))}  # numbers, then errors
+FORMS = {  # numbers, then errors, then colour differences
+    "lobe_tensor": (SIZES, (0.045, 0.01), (1.0, 0.5)),
+    "lobe_harmonics": ((107, 214, 320, 513), (0.045,), (1.0, 0.5)),
+}
+RANDOM_DIRECTIONS = 1_000_000
 STORED = ("float64", "float16", "quantised")
 DRAWN = {  # in the picture: label, colour, line
     "lobe_tensor, quantised": ("lobe_tensor, quantised", "C0", "-"),
@@ -115,7 +119,7 @@ def records(
         )
 
     for size in sizes:
-        for method in [form for form, (allowed, _) in FORMS.items() if size in allowed]:
+        for method in [form for form, (allowed, *_) in FORMS.items() if size in allowed]:
             options = RepresentOptions(method, TargetOptions(numbers=size))
             compact, timing = timed(lambda options=options: represent(field, options, gridded), repeats)
             found = evaluate_on_axes(compact, *axes)
@@ -153,7 +157,8 @@ def measure(name: str, *, with_paper: bool) -> dict[str, list[tuple[float, float
 
     def report(method, numbers, size, eta, more=""):
         found = size, 100 * np.median(eta[known]), 100 * eta[known].max()
-        curves.setdefault(method, []).append(found)
+        if "Delta E" not in more.partition(";")[0]:  # of another kind of error
+            curves.setdefault(method, []).append(found)
         print(
             f"{method:<26} {numbers / per_angle:>8.1f} {size:>8} {found[1]:>9.3f} {found[2]:>9.3f} {more}", flush=True
         )
@@ -179,12 +184,19 @@ def measure(name: str, *, with_paper: bool) -> dict[str, list[tuple[float, float
 
     print(f"\n{Path(name).name}: {known.sum()} of {per_angle} incident angles have data, {brdf.nbytes} bytes of grid")
     print(f"{'method':<26} {'numbers':>8} {'bytes':>8} {'median %':>9} {'worst %':>9}")
-    for method, (sizes, errors) in FORMS.items():
-        for target in [TargetOptions(numbers=size) for size in sizes] + [TargetOptions(error=e) for e in errors]:
+    for method, (sizes, errors, differences) in FORMS.items():
+        targets = [TargetOptions(numbers=size) for size in sizes] + [TargetOptions(error=e) for e in errors]
+        for target in targets + [TargetOptions(delta_e=difference) for difference in differences]:
             options = RepresentOptions(method=method, target=target)
             promises = make_target(target, per_angle, len(wavelength_nm)).stops
             asked = f"{100 * target.error:g} % everywhere; " if target.error else ""
-            report_stored(method, represent(field, options, gridded), field, promises, asked)
+            asked += f"Delta E {target.delta_e:g} everywhere; " if target.delta_e else ""
+            compact = represent(field, options, gridded)
+            report_stored(method, compact, field, promises, asked)
+            if target.numbers == 214:
+                print(f"  least of {RANDOM_DIRECTIONS} random directions: {least_value(compact):.3g} 1/sr")
+    if gridded.field is not None:
+        interpolate_nodes(gridded, known)
     for method, baseline in BASELINES.items():
         for size in SIZES:
             numbers, found = baseline(brdf, known, size * per_angle)
@@ -198,6 +210,37 @@ def measure(name: str, *, with_paper: bool) -> dict[str, list[tuple[float, float
     leave_out(gridded, field, known)
     print(f"{time.perf_counter() - start:.0f} s", flush=True)
     return curves
+
+
+def least_value(compact) -> float:
+    """Return the least value in random directions."""
+    from sbrdf_jax.evaluation import evaluate_in_chunks
+
+    angles = np.random.default_rng(0).uniform(0, 1, (3, RANDOM_DIRECTIONS))
+    theta_i, theta_o, phi_o = angles * np.array([[np.pi / 2], [np.pi / 2], [2 * np.pi]])
+    parts = np.array_split(np.arange(RANDOM_DIRECTIONS), 20)
+    return min(float(evaluate_in_chunks(compact, theta_i[p], theta_o[p], phi_o[p]).min()) for p in parts)
+
+
+def interpolate_nodes(gridded, known) -> None:
+    """Print the error of interpolating all nodes, uncompressed, at the midpoints of theta_o and phi_o."""
+    from scipy.interpolate import CubicSpline
+
+    from sbrdf_jax.grid import midpoints
+    from sbrdf_jax.metrics import on_axes
+
+    theta_i, theta_o, phi_o = (np.asarray(axis) for axis in (gridded.theta_i, gridded.theta_o, gridded.phi_o))
+    nodes = dataclasses.replace(gridded, field=None)
+    middle = midpoints(theta_o), midpoints(phi_o)
+    logarithm = CubicSpline(theta_o, np.log(np.maximum(np.asarray(gridded.brdf)[known], 1e-9)), axis=1)(middle[0])
+    cubic = np.exp(CubicSpline(phi_o, logarithm, axis=2)(middle[1]))
+    for method, found in (
+        ("windowed sinc", [on_axes(nodes, angle, *middle) for angle in theta_i[known]]),
+        ("log-cubic", cubic),
+    ):
+        wanted = [on_axes(gridded, angle, *middle) for angle in theta_i[known]]
+        eta = [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(found, wanted, strict=True)]
+        print(f"nodes, {method:<19} {'':>8} {'':>8} {'':>9} {'':>9} between {100 * np.median(eta):.2f}", flush=True)
 
 
 def error_near_mirror(compact, gridded, known, count: int = 5000) -> float:
