@@ -321,6 +321,20 @@ def test_midway_a_row_tells_what_is_known_by_reciprocity_where_rows_agree_on_it(
         assert off[:, 1::2].mean() < 0.6 * plain[:, 1::2].mean()
 
 
+def test_left_out_incident_angles_are_measured_where_nothing_is_known_between_them(amber):
+    gridded, field, _ = amber
+    plan = represent_with_plan(field, NUMBERS, gridded)[1]
+    second = grid_of(gridded.brdf[::2], theta_i=THETA[::2])
+    twice = half_field(field_of(second), second.brdf, second).blocks[-1]
+    whole = np.concatenate([twice.brdf[:, :, ::2], twice.brdf[:, :, -3::-2]], axis=2)
+    expected = [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(whole, gridded.brdf[1::2], strict=True)]
+    np.testing.assert_allclose(plan["left_out_error"][1::2], expected, rtol=0.02)  # 0 and 360 degrees are one
+    assert np.isnan(plan["left_out_error"][::2]).all()
+    four = grid_of(gridded.brdf[:4], theta_i=THETA[:4])
+    few = half_field(field_of(four), four.brdf, four)
+    assert few.left_out is not None and np.isnan(few.left_out).all()
+
+
 def test_midway_no_value_is_greater_than_the_rows_around_it_have(amber):
     brdf = np.array(amber[0].brdf)
     brdf[1::2, :, 3:9] = brdf[1::2, :, -9:-3] = 0.0

@@ -14,7 +14,7 @@ from sbrdf_jax.encoding import logarithm
 from sbrdf_jax.evaluation import evaluate_where
 from sbrdf_jax.grid import has_data, midpoints
 from sbrdf_jax.records import GriddedBRDF, SpectralField
-from sbrdf_jax.representation.midway import between_incident_angles
+from sbrdf_jax.representation.midway import between_incident_angles, left_out_error
 
 SKIPPED_WEIGHT = 1e-3  # of a node that no scene needs: it has its neighbour's value, and is not to run wild
 UNKNOWN_WEIGHT = 0.01  # of an incident angle without data: it does not count, but is not to run wild
@@ -49,6 +49,7 @@ class HalfField(NamedTuple):
     known: Bool[np.ndarray, " theta_i"]  # incident angles that count: finite, not zero throughout, and with data
     asymmetry: float  # largest relative size of what is odd in phi_o, which is dropped
     is_field: bool = False  # what is between the nodes is known, not interpolated
+    left_out: Float[np.ndarray, " theta_i"] | None = None  # where it is not: eta of incident angles guessed from others
 
     @property
     def nodes(self) -> Block:
@@ -110,16 +111,16 @@ def half_field(
         blocks.append(block(theta_i, theta_o, phi_o, brdf, twins, share, needed))
 
     if gridded is None or gridded.field is None:
+        left_out = np.full(len(theta_i), np.nan)
         for at_o, at_phi in ((mid_o, mid_phi), (every_o, near)):
             add(nodes.theta_i, at_o, at_phi, _interpolate_logarithm(nodes, at_o, at_phi), GUESS_WEIGHT * share)
         gaps = np.diff(nodes.theta_i)
         if field.interpolate_theta_i and len(gaps) and np.ptp(gaps) < SAME_ANGLE:
-            between = between_incident_angles(
-                nodes.theta_i, nodes.theta_o, phi_o[:count], logarithm(nodes.brdf), share > 0
-            )
+            rows = nodes.theta_i, nodes.theta_o, phi_o[:count], logarithm(nodes.brdf), share > 0
             trust = min(float(gaps[0] / WIDE_GAP), 1.0) ** 8
-            add(midpoints(nodes.theta_i), *between, trust * less)
-        return HalfField(tuple(blocks), known, asymmetry)
+            add(midpoints(nodes.theta_i), *between_incident_angles(*rows), trust * less)
+            left_out[place] = left_out_error(*rows)
+        return HalfField(tuple(blocks), known, asymmetry, left_out=left_out)
     finite = np.isin(np.asarray(gridded.field.wavelength_nm), np.asarray(field.basis.wavelength_nm))
     cell, beside = cells_between(needed), beside_mirror(needed)
     rows = [(nodes.theta_i, share, cell, beside)]

@@ -80,7 +80,7 @@ def represent(
 
     Returns:
         The tensor, and a plan: ranks, what was promised and what was measured, `warnings`, and `half_field`, what it
-        was fitted to.
+        was fitted to; of a grid without a field `left_out_error`, eta of incident angles guessed from every second one.
 
     Numerics:
         Least squares of the values themselves; the clip at 0 comes last and lowers the error of a
@@ -127,6 +127,8 @@ def represent(
         interpolate_theta_i=field.interpolate_theta_i,
     )
     plan = {"method": "lobe_tensor", "ranks": np.array(np.shape(tensor.core)), "half_field": half}
+    if half.left_out is not None:
+        plan["left_out_error"] = half.left_out
     return tensor, plan | make_plan(target, achieved, worst, half)
 
 

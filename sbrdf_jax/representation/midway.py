@@ -67,6 +67,32 @@ def between_incident_angles(
     return at_o, at_phi, np.exp(value)
 
 
+def left_out_error(
+    theta_i: Float[np.ndarray, " i"],
+    theta_o: Float[np.ndarray, " o"],
+    phi_o: Float[np.ndarray, " p"],
+    logarithm: Float[np.ndarray, "i o p wavelength"],
+    usable: Bool[np.ndarray, " i"],
+) -> Float[np.ndarray, " i"]:
+    """Return how far off every second incident angle is, guessed from the others alone: eta of eq. (18); nan else.
+
+    Args are those of `between_incident_angles`. Their step is twice as wide there, so that it is an upper limit.
+    """
+    error = np.full(len(theta_i), np.nan)
+    if len(theta_i) < 5 or not usable[::2].all():
+        return error
+    at_o, at_phi, guess = between_incident_angles(theta_i[::2], theta_o, phi_o, logarithm[::2], usable[::2])
+    known_o, of_o = np.nonzero(np.abs(theta_o[:, None] - at_o) < SAME_ANGLE)
+    known_p, of_p = np.nonzero(np.abs(phi_o[:, None] - at_phi) < SAME_ANGLE)
+    twins = np.where(np.isclose(phi_o, np.pi), 1.0, 2.0)[known_p, None]
+    left = np.arange(1, 2 * len(guess), 2)
+    wanted = np.exp(logarithm[left][:, known_o][:, :, known_p])
+    off = np.einsum("iopw->i", twins * (guess[:, of_o][:, :, of_p] - wanted) ** 2)
+    error[left] = np.sqrt(off / np.einsum("iopw->i", twins * wanted**2))
+    error[~usable] = np.nan
+    return error
+
+
 def _smoother_path(along, usable, number: int, theta_o, step: float) -> Float[np.ndarray, "middle o p wavelength"]:
     """Return logarithms midway between the last `number` rows, 0 beside one that is not usable, where none counts.
 
