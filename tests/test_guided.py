@@ -45,9 +45,11 @@ from sbrdf_jax.resampling.guided.covariance import (
 )
 from sbrdf_jax.resampling.guided.error_model import (
     MAX_FACTOR,
+    MIRROR_PARAMETERS,
     ResidualScale,
     between_scale,
     estimate_floor,
+    estimate_mirror_deviation,
     fit_between_scale,
     noise_factors,
 )
@@ -70,7 +72,7 @@ from sbrdf_jax.resampling.guided.inverse import (
     whitener,
 )
 from sbrdf_jax.resampling.guided.lobe_fit import fit_lobe_model
-from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value, lobe_terms
+from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value, lobe_terms, mirror_share
 from sbrdf_jax.resampling.guided.lobe_slopes import lobe_slopes
 from sbrdf_jax.resampling.guided.merging import merge_samples
 from sbrdf_jax.resampling.guided.nodes import GRIDS, interpolate, mirror, mode_variance
@@ -618,6 +620,43 @@ def test_a_standard_error_grows_between_incident_angles_as_left_out_ones_need(rn
     np.testing.assert_allclose(between_scale(scale, jnp.asarray(at)), between_scale(scale, at), rtol=1e-12)
     assert fit_between_scale(theta_i[:1], ratios[:1]) == {}
     np.testing.assert_array_equal(between_scale(ResidualScale(np.zeros((2, 2, 2)), np.zeros(3), np.ones(3)), at), 1.0)
+
+
+def test_the_mirror_image_is_as_unsure_as_left_out_samples_of_it_were(rng):
+    share = np.r_[np.full(40, 0.9), np.full(1000, 0.3)]
+    error = np.abs(rng.normal(size=1040)) * np.where(share > 0.5, 0.9 * 0.7, 5.0)  # where it is a part, it is not asked
+    of_forty = estimate_mirror_deviation(share, error)
+    assert of_forty == pytest.approx(0.7 * np.sqrt(40 / (40 - MIRROR_PARAMETERS)), rel=0.25)
+    exact = np.sqrt((0.81 * (error[:40] ** 2).sum() + 1 / 33.4) / (32.4 - MIRROR_PARAMETERS + 1 / 33.4))
+    assert of_forty == pytest.approx(exact)
+    assert estimate_mirror_deviation(share[40:], error[40:]) == 1.0  # a factor of e
+    assert estimate_mirror_deviation(np.ones(2), np.zeros(2)) == 1.0  # two samples fit any model
+
+
+def test_a_standard_error_near_the_mirror_direction_has_the_doubt_of_the_mirror_image(field, rng):
+    field = jax.tree.map(np.array, field)
+    field.lobe.log_amplitude[1] += 15.0  # a mirror image that counts
+    theta = rng.uniform(0.1, 1.4, 60)
+    phi_o = np.pi + rng.normal(0, 0.05, 60)
+    at = guided_coordinates(theta, theta, phi_o, field.theta_limit)
+    step = 1e-6
+    louder = np.array(field.lobe.log_amplitude)
+    louder[1] += step
+    louder = dataclasses.replace(field.lobe, log_amplitude=louder)
+    slope_of_mirror = (lobe_log_value(louder, at, field.floor) - lobe_log_value(field.lobe, at, field.floor)) / step
+    share = mirror_share(field.lobe, at, field.floor)
+    np.testing.assert_allclose(share, slope_of_mirror, rtol=0, atol=1e-6)
+    assert ((share >= 0) & (share <= 1)).all() and share.max() > 0.5
+
+    def errors(deviation):
+        scale = dataclasses.replace(field.scale, mirror=np.array(deviation))
+        return evaluate_with_error(dataclasses.replace(field, scale=scale), field_whitener(field), theta, theta, phi_o)
+
+    (value, sure, noise), (again, unsure, same) = errors(0.0), errors(0.5)
+    np.testing.assert_array_equal(value, again)
+    np.testing.assert_array_equal(noise, same)
+    unit = value + 1 / log_scale(at, field.floor)[:, None]  # d value / d z
+    np.testing.assert_allclose(unsure**2 - sure**2, (0.5 * share * unit) ** 2, rtol=1e-6, atol=1e-12 * unit.max() ** 2)
 
 
 def test_held_out_samples_of_a_measured_paint(shared):

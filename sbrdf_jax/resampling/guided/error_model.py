@@ -24,6 +24,7 @@ COVERED = 0.6827
 SORTED_TOGETHER = 256  # residuals whose weights are summed before the sum is looked into
 NO_WEIGHT = 1e-9
 BETWEEN = (0.3, 10.0)  # bounds of what a standard error grows by between measured incident angles
+MIRROR_PARAMETERS = 3  # width, grazing exponent, amplitude: what samples of the mirror image are fitted with
 TABLE_WIDTH = 0.4  # nodes of the table over which residuals are pooled
 
 
@@ -90,6 +91,8 @@ class ResidualScale:
     # what a standard error grows by between incident angles; nothing in results of earlier versions
     between_theta_i: Any = dataclasses.field(default_factory=lambda: np.zeros(1))  # [knot] rad
     between_log_scale: Any = dataclasses.field(default_factory=lambda: np.zeros(1))  # [knot]
+    # deviation of the logarithm of the lobe model's mirror term; nothing in results of earlier versions
+    mirror: Any = dataclasses.field(default_factory=lambda: np.zeros(()))
 
 
 def fit_residual_scale(
@@ -132,6 +135,25 @@ def fit_residual_scale(
         missing = wanted - (before[part - 1, i, j, k] if part else 0.0)
         table[i, j, k] = size[parts[part]][min(int(np.searchsorted(own, missing)), len(own) - 1)]
     return ResidualScale(log_scale=np.log(np.maximum(table, 1e-6)), start=start, step=step)
+
+
+def estimate_mirror_deviation(share: Float[np.ndarray, " centre"], error: Float[np.ndarray, " centre"]) -> float:
+    """Estimate how far the logarithm of the mirror image may be off where no sample says.
+
+    The lobe model is fitted to all samples, those left out too: a peak that a few samples saw agrees with them
+    better than with others. What they are off by when they are left out counts more for the fewer they are; of
+    none, or no more than the model has parameters, a factor of e is assumed.
+
+    Args:
+        share: What part of z the mirror term is of.
+        error: Size of the residuals of z, left out.
+    """
+    peak = share > 0.5
+    number = float((share[peak] ** 2).sum())
+    assumed = 1 / (1 + number)
+    return float(
+        np.sqrt((share[peak] ** 2 @ error[peak] ** 2 + assumed) / (max(number - MIRROR_PARAMETERS, 0) + assumed))
+    )
 
 
 def fit_between_scale(theta_i: Float[np.ndarray, " group"], ratios: list[np.ndarray]) -> dict[str, np.ndarray]:

@@ -17,6 +17,7 @@ from sbrdf_jax.resampling.guided.coordinates import from_log, guided_coordinates
 from sbrdf_jax.resampling.guided.error_model import (
     ResidualScale,
     estimate_floor,
+    estimate_mirror_deviation,
     fit_between_scale,
     fit_residual_scale,
     noise_factors,
@@ -26,7 +27,7 @@ from sbrdf_jax.resampling.guided.error_model import (
 from sbrdf_jax.resampling.guided.field import GuidedField
 from sbrdf_jax.resampling.guided.inverse import Whitener, doubted, group_blocks, leave_group_out, mirror_lower
 from sbrdf_jax.resampling.guided.lobe_fit import density_weights, fit_amplitudes, fit_lobe_model
-from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
+from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value, mirror_share
 from sbrdf_jax.resampling.guided.nodes import ModeVariance
 from sbrdf_jax.resampling.guided.smoothing import choose_smoothing
 from sbrdf_jax.resampling.guided.spectrum import SpectralFilter, spectral_filter
@@ -112,6 +113,9 @@ def estimate(
     # a centre's own extra noise, or what averaging took from it, is not that of a new measurement
     spread = np.maximum(variance - noise, 0.0) + choice.noise
     scale = _calibrate(centres, samples, model + residual - out, spread, floor)
+    share = mirror_share(lobe, centres.at, floor).mean(axis=1)
+    deviation = estimate_mirror_deviation(share[seen], np.sqrt((out[seen] ** 2).mean(axis=1)))
+    scale = dataclasses.replace(scale, mirror=np.array(deviation))
     out, variance = leave_group_out(group_blocks(lower, centres.group), dual)
     unsure = np.maximum(variance - noise, 0.0)
     scale = _calibrate_between(scale, centres, samples, model + residual - out, unsure, choice.noise, floor)

@@ -33,7 +33,7 @@ from sbrdf_jax.resampling.guided.covariance import (
 )
 from sbrdf_jax.resampling.guided.error_model import ResidualScale, between_scale, residual_scale
 from sbrdf_jax.resampling.guided.inverse import Whitener, whitener
-from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value
+from sbrdf_jax.resampling.guided.lobe_model import LobeModel, lobe_log_value, mirror_share
 from sbrdf_jax.resampling.guided.nodes import (
     GRIDS,
     POLAR_GRIDS,
@@ -201,9 +201,11 @@ def _errors(field: GuidedField, at: Coordinates, z, variance):
     """Return values, standard errors and the noise of one measurement [1/sr] from z and its variance."""
     scale = log_scale(at, field.floor)
     xp = array_module(z, variance)
-    unit = residual_scale(field.scale, at.theta_i, at.half, z) * slope(z, scale)
+    local, unit = residual_scale(field.scale, at.theta_i, at.half, z), slope(z, scale)
     deviation = xp.sqrt(variance) * between_scale(field.scale, at.theta_i)
-    return from_log(z, scale), unit * deviation[..., None], unit * xp.sqrt(field.noise_level)
+    mirror = field.scale.mirror * mirror_share(field.lobe, at, field.floor)
+    error = xp.sqrt((local * deviation[..., None]) ** 2 + mirror**2)
+    return from_log(z, scale), unit * error, unit * local * xp.sqrt(field.noise_level)
 
 
 @on_host

@@ -67,6 +67,15 @@ def lobe_terms(shape: Float[AnyArray, " 9"], at: Coordinates, mirror_power: floa
     return xp.stack(terms, axis=-1)
 
 
+def mirror_share(
+    model: LobeModel, at: Coordinates, floor: Float[AnyArray, ""] | float
+) -> Float[AnyArray, "*shape wavelength"]:
+    """Return by how much the model's z grows with the logarithm of its mirror term: 1 where that is all of it."""
+    xp = array_module(model.shape, at.theta_i)
+    terms, amplitude = lobe_terms(model.shape, at, model.mirror_power), xp.exp(model.log_amplitude)
+    return terms[..., 1:2] @ amplitude[1:2] / (terms @ amplitude + 1 / log_scale(at, floor)[..., None])
+
+
 def lobe_log_value(
     model: LobeModel, at: Coordinates, floor: Float[AnyArray, ""] | float
 ) -> Float[AnyArray, "*shape wavelength"]:
