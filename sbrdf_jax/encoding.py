@@ -17,6 +17,7 @@ from sbrdf_jax.records import GriddedBRDF, SpectralBasis, SpectralField
 
 BASIS_KINDS = ("fourier", "cosine", "data", "log_data", "identity")
 FEWEST_WAVELENGTHS = 5  # below it a series says less than the samples
+LARGEST = 80.0  # logarithm; what nobody needed may be anything, and is finite in float32 too
 SMALLEST = 1e-9  # of the largest value; logarithms of less are not taken
 UNIFORM_TOLERANCE = 1e-6  # of the step; wavelengths closer to uniform are taken as uniform
 
@@ -152,8 +153,9 @@ def transform(brdf: Float[AnyArray, "*shape wavelength"], basis: SpectralBasis) 
 
 
 def restore(value: Float[AnyArray, "*shape wavelength"], basis: SpectralBasis) -> Float[AnyArray, "*shape wavelength"]:
-    """Return spectra [1/sr] from what the functions of a basis add up to."""
-    return array_module(value).exp(value) if basis.is_logarithmic else value
+    """Return spectra [1/sr] from what the functions of a basis add up to; of a logarithm at most exp of `LARGEST`."""
+    xp = array_module(value)
+    return xp.exp(xp.minimum(value, LARGEST)) if basis.is_logarithmic else value
 
 
 def vector_basis(

@@ -102,6 +102,7 @@ def test_vectors_of_the_logarithm_keep_every_spectrum_positive(rng):
     wild = encoding.decode(5 * rng.normal(size=(50, 3)), basis, np.array([400.0, 512.3]))
     assert (wild > 0).all() and encoding.coefficient_names(basis) == ("v_0", "v_1", "v_2")
 
+    assert np.isfinite(encoding.decode(np.full((1, 3), 1e4), basis)).all()
     spectra[1, 2], spectra[2, 3, 4] = 0.0, np.nan
     coefficient = encoding.encode(spectra, basis)
     assert np.isfinite(np.delete(coefficient.reshape(60, 3), 43, axis=0)).all() and np.isnan(coefficient[2, 3]).all()

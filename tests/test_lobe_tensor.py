@@ -450,6 +450,20 @@ def test_targets_are_met_and_the_plan_says_so(amber, target):
     np.testing.assert_array_equal(found.status, [Status.OK] * 6 + [Status.SKIPPED])
 
 
+@pytest.mark.parametrize("kind", ["data", "log_data"])
+def test_a_colour_difference_of_a_part_of_the_hemispheres(amber, kind):
+    needed = np.zeros(amber[0].brdf.shape[:3], bool)
+    needed[1:4, :2, ::24] = needed[2:5, 3:5] = True
+    brdf = np.where(needed[..., None], amber[0].brdf, np.nan)
+    gridded = dataclasses.replace(grid_of(brdf), needed=needed)
+    field = encode_field(gridded, data_basis(WAVELENGTH_NM, np.nan_to_num(brdf), 4, kind))
+    for block in half_field(field, brdf, gridded, in_colour=True, in_logarithm=kind == "log_data").blocks:
+        assert np.isfinite(block.weight).all()
+    found, plan = represent_with_plan(field, options(delta_e=1.0), gridded)
+    assert plan["is_met"]
+    assert error_at_nodes(found, gridded, colour_matching(WAVELENGTH_NM))["delta_e_median"][2:5].max() <= 1.0
+
+
 def test_where_a_colour_difference_is_asked_for_errors_count_by_the_slope_of_lightness(amber):
     gridded, field, _ = amber
     brdf = np.array(gridded.brdf)

@@ -179,12 +179,12 @@ def _block(theta_i, theta_o, phi_o, brdf, twins, share, needed, *, in_colour: bo
     if in_colour:
         slope = np.maximum(np.pi * clean.mean(axis=-1), LINEAR_BELOW) ** (-2 / 3)  # 1 for the perfect diffuser
         seen = np.where(needed, slope**2 * each * twins, 0.0).sum(axis=(1, 2))
-        relative += COLOUR_SHARE * slope**2 / np.where(usable, seen, 1.0)[:, None, None]
+        relative += COLOUR_SHARE * slope**2 / np.where(seen > 0, seen, 1.0)[:, None, None]
     weight = 1 / energy + relative
     if in_logarithm:
         typical = np.median(each, axis=(1, 2), keepdims=True)
         fades = each / np.maximum(each + NOTHING * typical, 1e-300)
-        weight = (weight * each + RELATIVE_SHARE / number * fades) / clean.shape[-1]
+        weight = (weight * each + RELATIVE_SHARE / np.maximum(number, 1) * fades) / clean.shape[-1]
     weight = np.where(usable, share, 0.0)[:, None, None] * weight * twins
     return Block(theta_i, theta_o, phi_o, clean, np.where(needed, weight, SKIPPED_WEIGHT * weight), needed)
 
