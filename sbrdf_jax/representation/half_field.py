@@ -23,7 +23,7 @@ MIRROR_WEIGHT = 0.02  # of the error near the mirror direction, closer to it tha
 NEAR_MIRROR = np.array([2 / 3, 1 / 3, 1 / 6, 1 / 12, 1 / 24, 0.0])  # steps of phi_o off the plane of incidence
 GUESS_WEIGHT = 1e-4  # where it is interpolated: enough that nothing runs wild
 WIDE_GAP = np.radians(15.0)  # of incident angles so far apart what is midway counts like a node; below it splines
-# are better by the fourth power of the gap, and it counts less
+# are better by the sixth power of the gap, and it counts less
 RELATIVE_SHARE = 0.03  # of the error relative to each direction's own energy
 RELATIVE_FLOOR = 1e-3  # of the mean energy of a direction
 NOTHING = 1e-6  # of the energy of a typical direction: its logarithm does not count
@@ -117,7 +117,7 @@ def half_field(
         gaps = np.diff(nodes.theta_i)
         if field.interpolate_theta_i and len(gaps) and np.ptp(gaps) < SAME_ANGLE:
             rows = nodes.theta_i, nodes.theta_o, phi_o[:count], logarithm(nodes.brdf), share > 0
-            trust = min(float(gaps[0] / WIDE_GAP), 1.0) ** 8
+            trust = min(float(gaps[0] / WIDE_GAP), 1.0) ** 12
             add(midpoints(nodes.theta_i), *between_incident_angles(*rows), trust * less)
             left_out[place] = left_out_error(*rows)
         return HalfField(tuple(blocks), known, asymmetry, left_out=left_out)
