@@ -18,7 +18,7 @@ from sbrdf_jax.evaluation import (
     evaluate_standard_error,
     evaluate_where,
 )
-from sbrdf_jax.folds import Folds, read_fold_file
+from sbrdf_jax.folds import NO_FOLD, Folds, read_fold_file
 from sbrdf_jax.formats import read, write_samples
 from sbrdf_jax.grid import make_grid
 from sbrdf_jax.nnls import ProjectedNewton
@@ -657,6 +657,18 @@ def test_a_standard_error_near_the_mirror_direction_has_the_doubt_of_the_mirror_
     np.testing.assert_array_equal(noise, same)
     unit = value + 1 / log_scale(at, field.floor)[:, None]  # d value / d z
     np.testing.assert_allclose(unsure**2 - sure**2, (0.5 * share * unit) ** 2, rtol=1e-6, atol=1e-12 * unit.max() ** 2)
+
+
+def test_an_incident_angle_beyond_the_others_is_not_too_sure(shared):
+    raw = read(shared("data/cornell/garnet_red.brdf"), InputOptions(path="garnet_red"))
+    degrees = np.degrees(raw.theta_i).round().astype(int)
+    folds = Folds(np.where(degrees == degrees.max(), 0, NO_FOLD), "the last one")
+    grid = make_grid(raw, GridOptions(), bilateral=True)
+    found = predict_held_out(raw, folds, grid, OPTIONS, bilateral=True)
+    rows = folds.label == 0
+    assert found.expected_error is not None
+    share = coverage(found.predicted[rows], raw.value[rows], found.expected_error[rows])
+    assert 0.4 < share < 0.9  # .31 where it is held against its own scale of errors, which is not known without it
 
 
 def test_held_out_samples_of_a_measured_paint(shared):

@@ -182,16 +182,22 @@ def _calibrate(centres: Centres, samples: RawSamples, predicted, spread, floor: 
 def _calibrate_between(
     scale: ResidualScale, centres: Centres, samples: RawSamples, predicted, unsure, noise: float, floor: float
 ) -> ResidualScale:
-    """Calibrate it between incident angles too, by predictions that did not see a sample's incident angle."""
+    """Calibrate it between incident angles too, by predictions that did not see a sample's incident angle.
+
+    They are held against the scale that would be known there without it: that of the angles beside.
+    """
     centre, z, error = _errors_of_predictions(centres, samples, predicted, floor)
-    theta_i, half = centres.angles[0, centre], centres.at.half[centre]
-    squares = (error / residual_scale(scale, theta_i, half, z)) ** 2 - noise
-    ratio = np.maximum(squares, 0.0) / np.maximum(unsure[centre], TINY)[:, None]
-    group = centres.group[centre]
+    theta_i, half, group = centres.angles[0, centre], centres.at.half[centre], centres.group[centre]
     members = [group == number for number in np.unique(group)]
     members.sort(key=lambda rows: np.median(theta_i[rows]))
-    angles = np.array([np.median(theta_i[rows]) for rows in members])
-    return dataclasses.replace(scale, **fit_between_scale(angles, [ratio[rows].ravel() for rows in members]))
+    angles = [float(np.median(theta_i[rows])) for rows in members]
+    ratios = []
+    for number, rows in enumerate(members):
+        beside = [angles[k] for k in (number - 1, number + 1) if 0 <= k < len(angles)] or angles
+        local = [residual_scale(scale, np.full(rows.sum(), angle), half[rows], z[rows]) for angle in beside]
+        squares = error[rows] ** 2 / (local[0] * local[-1]) - noise
+        ratios.append((np.maximum(squares, 0.0) / np.maximum(unsure[centre[rows]], TINY)[:, None]).ravel())
+    return dataclasses.replace(scale, **fit_between_scale(np.array(angles), ratios))
 
 
 def _errors_of_predictions(centres: Centres, samples: RawSamples, predicted, floor: float):
