@@ -89,6 +89,12 @@ WRONG_KEYS_AND_VALUES = [
     ("grid: &a {reciprocal: *a}", "grid.reciprocal: found an alias", "written out"),
     ("[a]: 1", "2:1: found a key that is a list", "a word"),
     ('output: {path: "a\\0b"}', "2:16: output.path: found text with a character", "plain text"),
+    ("encode: {basis: log_data}\nrepresent: {method: paper}", "2:17: encode.basis", "because method paper"),
+    (
+        "encode: {basis: log_data}\nrepresent: {method: lobe_harmonics}",
+        "encode.basis: found log_data",
+        "expected another",
+    ),
     ("scene: " + "[" * 25, "2:27: found lists or blocks in each other", "at most 20"),
 ]
 
@@ -126,11 +132,6 @@ WRONG_OVERRIDES = [
         "input={path: x, bilateral: false}",
         "command line: input={path: x",
         "bilateral: found false; expected auto or true, because method guided",
-    ),
-    (
-        "{encode: {basis: log_data}, represent: {method: paper}}",
-        "command line: {encode",
-        "log_data",
     ),
     ("represent.target.numbers=9", "command line: represent.target.numbers=9: found ratio and numbers", "one of"),
 ]
