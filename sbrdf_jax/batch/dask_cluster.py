@@ -4,6 +4,7 @@ The only importer of dask, distributed and dask-jobqueue, which are the extra `c
 scheduler gives a dead worker's material to another; the locks keep what it may start twice apart.
 """
 
+import contextlib
 import importlib
 from collections.abc import Sequence
 from typing import Any
@@ -17,7 +18,7 @@ from sbrdf_jax.batch.states import Outcome
 from sbrdf_jax.batch.worker import Work
 from sbrdf_jax.errors import UserError
 
-SECONDS_TO_ANSWER = 10
+SECONDS_TO_ANSWER = SECONDS_TO_RESTART = 10
 JOBQUEUE = {
     "slurm": "SLURMCluster",
     "pbs": "PBSCluster",
@@ -58,9 +59,17 @@ def run_dask(
             client = _connect(distributed, cluster or options.dask.address)
             with client:
                 _run(distributed, client, materials, work, watcher)
+                if cluster is not None and options.dask.cluster == "local":
+                    _wait_for_restarts(client, workers)
         finally:
             if cluster is not None:
                 cluster.close()
+
+
+def _wait_for_restarts(client: Any, workers: int) -> None:
+    """Wait until workers that died are there again: dask cannot close one that is just being started."""
+    with contextlib.suppress(TimeoutError):  # then one does not start at all
+        client.wait_for_workers(workers, timeout=SECONDS_TO_RESTART)
 
 
 def _run(distributed: Any, client: Any, materials: Sequence[Material], work: Work, watcher: Watcher) -> None:
