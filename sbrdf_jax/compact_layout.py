@@ -17,6 +17,7 @@ from sbrdf_jax.hdf5 import attribute, dataset, dataset_of, degrees, scale
 from sbrdf_jax.hdf5 import read as read_as_written
 from sbrdf_jax.lobes import LOBE_KINDS
 from sbrdf_jax.metrics import stored_numbers
+from sbrdf_jax.options import VECTOR_KINDS
 from sbrdf_jax.records import STATUS_TEXT, CompactBRDF, LobeHarmonics, LobeTensor, SpectralBasis, Status
 from sbrdf_jax.representation.joint_fit import NUM_LOBES
 from sbrdf_jax.representation.lobe_family import SHAPES
@@ -308,7 +309,7 @@ def write_basis(
 
 def read_basis(group: h5py.Group, kind: str, wavelength_nm: np.ndarray, count: int) -> SpectralBasis:
     """Read a spectral basis by its kind and count; vectors found in a material lie in the group."""
-    if kind in ("data", "log_data"):
+    if kind in VECTOR_KINDS:
         return vector_basis(wavelength_nm, read(group, "spectral_vectors", (count, len(wavelength_nm))), kind)
     basis = make_basis(wavelength_nm, str(kind), count)
     if np.shape(basis.synthesis)[0] != count:

@@ -13,7 +13,15 @@ from typing import Any
 
 from sbrdf_jax.errors import UserError
 from sbrdf_jax.option_checks import check_options, describe, option_at
-from sbrdf_jax.options import DEFAULT_VECTORS, ErrorBudget, OutgoingOptions, RunOptions, TargetOptions
+from sbrdf_jax.options import (
+    ADDING_METHODS,
+    DEFAULT_VECTORS,
+    VECTOR_KINDS,
+    ErrorBudget,
+    OutgoingOptions,
+    RunOptions,
+    TargetOptions,
+)
 from sbrdf_jax.yaml_tree import KeyPath, Tree, dotted, dump_yaml, graft, parse_yaml
 
 # A row goes when its method arrives: key, which values are refused, and what there is.
@@ -30,7 +38,7 @@ AUTO_RESAMPLE: dict[str, dict[str, Any]] = {
     "guided": {"smoothness_weight": "data", "tolerance": 1e-6},
 }
 AUTO_BASIS = {"paper": "fourier"}  # else data
-AUTO_COEFFICIENTS = {"data": DEFAULT_VECTORS, "log_data": DEFAULT_VECTORS}  # else 19, as in the paper
+AUTO_COEFFICIENTS = dict.fromkeys(VECTOR_KINDS, DEFAULT_VECTORS)  # else 19, as in the paper
 AUTO_DEGREE = {"paper": 4}  # else 8
 
 BUILTIN = "builtin:"
@@ -262,7 +270,7 @@ def _problems(options: RunOptions) -> Iterator[tuple[str, str]]:
     encode = resolve(options).encode
     if encode.basis == "fourier" and isinstance(encode.coefficients, int) and encode.coefficients % 2 == 0:
         yield "encode.coefficients", f"found {encode.coefficients}; expected an odd number, because basis is fourier"
-    if encode.basis == "log_data" and options.represent.method in ("paper", "lobe_harmonics"):
+    if encode.basis == "log_data" and options.represent.method in ADDING_METHODS:
         method = options.represent.method
         yield "encode.basis", f"found log_data; expected another, because method {method} adds lobes and harmonics up"
     method, weight = options.resample.method, options.resample.smoothness_weight

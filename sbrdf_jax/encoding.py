@@ -12,10 +12,10 @@ from jaxtyping import Array, Float
 from sbrdf_jax.array_module import AnyArray, array_module
 from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.interpolation import spectral_weights
-from sbrdf_jax.options import DEFAULT_VECTORS
+from sbrdf_jax.options import DEFAULT_VECTORS, VECTOR_KINDS
 from sbrdf_jax.records import GriddedBRDF, SpectralBasis, SpectralField
 
-BASIS_KINDS = ("fourier", "cosine", "data", "log_data", "identity")
+BASIS_KINDS = ("fourier", "cosine", *VECTOR_KINDS, "identity")
 FEWEST_WAVELENGTHS = 5  # below it a series says less than the samples
 LARGEST = 80.0  # logarithm; what nobody needed may be anything, and is finite in float32 too
 SMALLEST = 1e-9  # of the largest value; logarithms of less are not taken
@@ -56,7 +56,7 @@ def coefficients_allowed(num_wavelengths: int, wanted: int, kind: str = "fourier
     if num_wavelengths < FEWEST_WAVELENGTHS:
         text = f"{num_wavelengths} wavelengths are too few for a series: the samples themselves are stored"
         return AllowedBasis("identity", num_wavelengths, text)
-    if kind in ("data", "log_data"):
+    if kind in VECTOR_KINDS:
         used = min(wanted, num_wavelengths)
         text = f"{used} spectral coefficients in place of {wanted}: there are no more wavelengths"
         return AllowedBasis(kind, used, text if used < wanted and wanted != DEFAULT_VECTORS else None)
@@ -75,7 +75,7 @@ def make_basis(wavelength_nm: Float[np.ndarray, " wavelength"], kind: str, coeff
 
     Args:
         wavelength_nm: Measured wavelengths [nm], increasing; both ends belong to the domain.
-        kind: One of `BASIS_KINDS` but "data" and "log_data", which `data_basis` makes.
+        kind: One of `BASIS_KINDS` but those of `VECTOR_KINDS`, which `data_basis` makes.
         coefficients: Coefficients wanted; `coefficients_allowed` says how many are used, and why.
 
     Returns:
@@ -90,7 +90,7 @@ def make_basis(wavelength_nm: Float[np.ndarray, " wavelength"], kind: str, coeff
     if wavelength_nm.size == 0 or not np.all(step > 0):
         raise ValueError("wavelength_nm: expected one wavelength or more, increasing")
     kind, count, _ = coefficients_allowed(wavelength_nm.size, coefficients, kind)
-    if kind in ("data", "log_data"):
+    if kind in VECTOR_KINDS:
         raise ValueError(f'basis "{kind}": it follows from a material, by data_basis')
     if kind == "identity":
         return SpectralBasis(wavelength_nm, np.eye(count), np.eye(count), kind, uniform=False)

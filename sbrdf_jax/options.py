@@ -23,6 +23,8 @@ PhiStepDeg = Annotated[float, Ge(0.1), Le(90)]
 _STRICT: Any = {"extra": "forbid", "strict": True, "allow_inf_nan": False, "use_attribute_docstrings": True}
 _EXACTLY_ONE: Any = _STRICT | {"json_schema_extra": {"minProperties": 1, "maxProperties": 1}}
 
+VECTOR_KINDS = ("data", "log_data")  # spectral bases whose functions are found in a material
+ADDING_METHODS = ("paper", "lobe_harmonics")  # forms that add lobes and harmonics up, which logarithms do not
 DEFAULT_VECTORS = 12  # of basis "data": with fewer wavelengths fewer are meant
 
 

@@ -14,7 +14,7 @@ from sbrdf_jax.grid import Grid, has_data, make_grid
 from sbrdf_jax.host_blas import one_blas_thread
 from sbrdf_jax.metrics import live_wavelengths, measure, needed_nodes, on_rows
 from sbrdf_jax.needs import Needs, restrict_theta_i
-from sbrdf_jax.options import EncodeOptions, RunOptions
+from sbrdf_jax.options import VECTOR_KINDS, EncodeOptions, RunOptions
 from sbrdf_jax.plan import PlanRow, describe_needs, plan_run, plan_validation, predict_cost
 from sbrdf_jax.progress import Progress, StageClock
 from sbrdf_jax.quadrature import Quadrature, choose_quadrature
@@ -210,7 +210,7 @@ def spectral_basis(gridded: GriddedBRDF, options: EncodeOptions) -> SpectralBasi
     """Return the spectral basis that the options name; that of the data from the incident angles that have any."""
     wavelength_nm, wanted = np.asarray(gridded.wavelength_nm), int(options.coefficients)
     allowed = coefficients_allowed(len(wavelength_nm), wanted, options.basis)
-    if allowed.kind not in ("data", "log_data"):
+    if allowed.kind not in VECTOR_KINDS:
         return make_basis(wavelength_nm, allowed.kind, wanted)
     known = has_data(gridded)
     brdf = np.where(needed_nodes(gridded)[..., None], np.asarray(gridded.brdf), 0.0)

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from sbrdf_jax.options import VECTOR_KINDS
 from sbrdf_jax.status import STATUS_TEXT as STATUS_TEXT
 from sbrdf_jax.status import Status as Status
 
@@ -118,7 +119,7 @@ class SpectralBasis:
     @property
     def stores_vectors(self) -> bool:
         """True where the functions are found in a material, and do not follow from kind and count."""
-        return self.kind in ("data", "log_data")
+        return self.kind in VECTOR_KINDS
 
     @property
     def is_logarithmic(self) -> bool:

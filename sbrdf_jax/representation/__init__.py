@@ -6,7 +6,7 @@ import numpy as np
 
 from sbrdf_jax.colour import ColourMatching
 from sbrdf_jax.host_blas import one_blas_thread
-from sbrdf_jax.options import ErrorBudget, RepresentOptions
+from sbrdf_jax.options import ADDING_METHODS, ErrorBudget, RepresentOptions
 from sbrdf_jax.records import CompactBRDF, GriddedBRDF, LobeHarmonics, LobeTensor, SpectralField
 from sbrdf_jax.representation.target import Target, in_words, make_target
 from sbrdf_jax.runtime import require_float64
@@ -45,7 +45,7 @@ def represent_with_plan(
     from sbrdf_jax.representation import auto, lobe_harmonics, lobe_tensor, paper
 
     require_float64()
-    if field.basis.is_logarithmic and options.method in ("paper", "lobe_harmonics"):
+    if field.basis.is_logarithmic and options.method in ADDING_METHODS:
         raise ValueError(f"basis log_data: method {options.method} adds lobes and harmonics up, not logarithms")
     if options.method == "paper":
         compact, plan = paper.represent(field, options)

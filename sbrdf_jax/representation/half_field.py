@@ -14,7 +14,8 @@ from sbrdf_jax.encoding import logarithm
 from sbrdf_jax.evaluation import evaluate_where
 from sbrdf_jax.grid import has_data, midpoints
 from sbrdf_jax.records import GriddedBRDF, SpectralField
-from sbrdf_jax.representation.midway import between_incident_angles, left_out_error
+from sbrdf_jax.representation.midway import Rows, between_incident_angles, left_out_error
+from sbrdf_jax.representation.target import azimuth_twins
 
 SKIPPED_WEIGHT = 1e-3  # of a node that no scene needs: it has its neighbour's value, and is not to run wild
 UNKNOWN_WEIGHT = 0.01  # of an incident angle without data: it does not count, but is not to run wild
@@ -96,30 +97,28 @@ def half_field(
     asymmetry = float(np.sqrt((_energy(odd, np.ones(count))[usable] / energy[usable]).max()))
     place = np.arange(usable.argmax(), len(usable) - usable[::-1].argmax())  # from the first to the last
     share = np.where(known, 1.0, np.where(usable, UNKNOWN_WEIGHT, 0.0))[place]
-    weight = np.where(np.arange(count) == count - 1, 1.0, 2.0)  # phi_o = 180 degrees is one node, others have twins
     needed = needed[place]
     block = functools.partial(_block, in_colour=in_colour, in_logarithm=in_logarithm)
-    nodes = block(theta_i[place], theta_o, phi_o[:count], even[place], weight, share, needed)
+    nodes = block(theta_i[place], theta_o, phi_o[:count], even[place], share, needed)
     mid_o, mid_phi = midpoints(theta_o), midpoints(phi_o[:count])
     every_o, near = near_mirror(theta_o, phi_o)
     less = np.minimum(share[:-1], share[1:])
     blocks = [nodes]
 
     def add(theta_i, theta_o, phi_o, brdf, share, needed=None) -> None:
-        twins = np.where(np.isclose(phi_o, np.pi), 1.0, 2.0)
         needed = np.ones(brdf.shape[:3], bool) if needed is None else needed
-        blocks.append(block(theta_i, theta_o, phi_o, brdf, twins, share, needed))
+        blocks.append(block(theta_i, theta_o, phi_o, brdf, share, needed))
 
     if gridded is None or gridded.field is None:
-        left_out = np.full(len(theta_i), np.nan)
+        left_out, logarithms = np.full(len(theta_i), np.nan), logarithm(nodes.brdf)
         for at_o, at_phi in ((mid_o, mid_phi), (every_o, near)):
-            add(nodes.theta_i, at_o, at_phi, _interpolate_logarithm(nodes, at_o, at_phi), GUESS_WEIGHT * share)
+            add(nodes.theta_i, at_o, at_phi, _interpolate(nodes, logarithms, at_o, at_phi), GUESS_WEIGHT * share)
         gaps = np.diff(nodes.theta_i)
         if field.interpolate_theta_i and len(gaps) and np.ptp(gaps) < SAME_ANGLE:
-            rows = nodes.theta_i, nodes.theta_o, phi_o[:count], logarithm(nodes.brdf), share > 0
+            rows = Rows(*nodes[:3], logarithms, share > 0)
             trust = min(float(gaps[0] / WIDE_GAP), 1.0) ** 12
-            add(midpoints(nodes.theta_i), *between_incident_angles(*rows), trust * less)
-            left_out[place] = left_out_error(*rows)
+            add(midpoints(nodes.theta_i), *between_incident_angles(rows), trust * less)
+            left_out[place] = left_out_error(rows)
         return HalfField(tuple(blocks), known, asymmetry, left_out=left_out)
     finite = np.isin(np.asarray(gridded.field.wavelength_nm), np.asarray(field.basis.wavelength_nm))
     cell, beside = cells_between(needed), beside_mirror(needed)
@@ -160,7 +159,7 @@ def _evaluate_needed(gridded: GriddedBRDF, theta_i, theta_o, phi_o, needed: Bool
     return value
 
 
-def _block(theta_i, theta_o, phi_o, brdf, twins, share, needed, *, in_colour: bool, in_logarithm: bool) -> Block:
+def _block(theta_i, theta_o, phi_o, brdf, share, needed, *, in_colour: bool, in_logarithm: bool) -> Block:
     """Return a block in which an incident angle weighs `share`, whatever its energy.
 
     Squares of errors count relative to the energy of the incident angle, as in eq. (18), and to
@@ -168,6 +167,7 @@ def _block(theta_i, theta_o, phi_o, brdf, twins, share, needed, *, in_colour: bo
     colour, they count by the slope of CIE 1976 L* there too. An error of a logarithm counts as
     that of the value to first order, and relative to the direction's own unless that is nothing.
     """
+    twins = azimuth_twins(phi_o)
     energy = _energy(brdf, twins)
     usable = np.isfinite(energy) & (energy > 0) & (share > 0)
     clean = np.where(usable[:, None, None, None], brdf, 0.0)
@@ -207,9 +207,9 @@ def _energy(brdf, twins):
     return np.einsum("iopw,iopw,p->i", brdf, brdf, twins)
 
 
-def _interpolate_logarithm(nodes: Block, theta_o, phi_o):
+def _interpolate(nodes: Block, logarithms: np.ndarray, theta_o, phi_o):
     """Interpolate nodes by monotone cubics through their logarithms: in theta_o, then in phi_o."""
     from scipy.interpolate import PchipInterpolator
 
-    value = PchipInterpolator(nodes.theta_o, logarithm(nodes.brdf), axis=1)(theta_o)
+    value = PchipInterpolator(nodes.theta_o, logarithms, axis=1)(theta_o)
     return np.exp(PchipInterpolator(nodes.phi_o, value, axis=2)(phi_o))

@@ -32,7 +32,7 @@ from sbrdf_jax.representation.joint_polish import polish_lobes
 from sbrdf_jax.representation.lobe_family import FIRST_HALF_SHAPE, SHAPES, width_limits
 from sbrdf_jax.representation.lobe_harmonics_value import even_orders
 from sbrdf_jax.representation.lobe_tensor import channels_of, make_plan
-from sbrdf_jax.representation.target import Target, is_met, make_target, measured
+from sbrdf_jax.representation.target import Target, azimuth_twins, is_met, make_target, measured
 
 DEFAULT_MAX_DEGREE = 8
 SEARCH_DEGREES = (4, 8)  # of the background while lobes are sought, up to the highest allowed
@@ -183,7 +183,7 @@ class _AngleFits:
         nodes = half.nodes
         counts = np.isin(nodes.theta_i, np.asarray(field.theta_i)[half.known])
         self.brdf = nodes.brdf[counts]
-        self.twins = np.r_[np.full(len(nodes.phi_o) - 1, 2.0), 1.0]
+        self.twins = azimuth_twins(nodes.phi_o)
         self.problem = _problem(half, counts, self.vectors, max_degree)
         self.matching = matching
         if target.in_colour and matching is None:

@@ -20,7 +20,7 @@ from sbrdf_jax.representation.direction_functions import (
     num_direction_functions,
 )
 from sbrdf_jax.representation.half_field import Block, HalfField, half_field
-from sbrdf_jax.representation.target import Target, in_words, is_met, make_target, measured, node_errors
+from sbrdf_jax.representation.target import Target, azimuth_twins, in_words, is_met, make_target, measured, node_errors
 from sbrdf_jax.representation.tensor_fit import Factors, Normal, TensorFit
 from sbrdf_jax.representation.tensor_growth import NO_ERROR, grow
 from sbrdf_jax.representation.tensor_pruning import stored_cells
@@ -236,9 +236,8 @@ class _Seen(NamedTuple):
     def of(cls, block: Block, rows: np.ndarray, columns: np.ndarray, floor: float, count: int) -> "_Seen":
         """See a block among the rows and columns of a fit."""
         function = [_functions(angle, block.theta_o, block.phi_o, floor, count) for angle in block.theta_i]
-        twins = np.where(np.isclose(block.phi_o, np.pi), 1.0, 2.0)
         places = (np.searchsorted(axis, own) for axis, own in ((rows, block.theta_i), (columns, block.theta_o)))
-        return cls(*places, np.stack(function), twins)
+        return cls(*places, np.stack(function), azimuth_twins(block.phi_o))
 
 
 def _functions(theta_i, theta_o, phi_o, floor, count) -> Float[np.ndarray, "o p function"]:
@@ -255,9 +254,8 @@ def channels_of(basis: SpectralBasis, half: HalfField) -> tuple[np.ndarray, np.n
     synthesis = np.asarray(basis.synthesis, np.float64)
     if basis.stores_vectors:
         rows = [np.sqrt(b.weight)[..., None] * transform(b.brdf, basis) for b in half.blocks]
-        return spectral_vectors(np.concatenate([row.reshape(-1, synthesis.shape[1]) for row in rows]))[
-            : len(synthesis)
-        ], np.eye(len(synthesis))
+        vectors = spectral_vectors(np.concatenate([row.reshape(-1, synthesis.shape[1]) for row in rows]))
+        return vectors[: len(synthesis)], np.eye(len(synthesis))
     columns, triangle = np.linalg.qr(synthesis.T)
     return columns.T, np.linalg.inv(triangle).T
 

@@ -4,12 +4,14 @@ SciPy's interpolation and images take half a second to import, and few runs need
 """
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from sbrdf_jax.angles import GRAZING, SAME_ANGLE
 from sbrdf_jax.grid import midpoints
+from sbrdf_jax.representation.target import azimuth_twins, node_errors
 
 EARLIER = 0.2  # of what a row adds midway may the next one add, though it happens to add less
 SMOOTH = 1e-3  # of a logarithm: what is as even as that is even
@@ -17,32 +19,29 @@ DOUBT = 2.0  # squares of what contradicts reciprocity count so much, of what it
 NEIGHBOURS = 3  # azimuths over which the two are compared
 
 
+class Rows(NamedTuple):
+    """A field at incident angles."""
+
+    theta_i: Float[np.ndarray, " i"]  # rad, equidistant
+    theta_o: Float[np.ndarray, " o"]  # rad, 0 to pi / 2
+    phi_o: Float[np.ndarray, " p"]  # rad, 0 to pi
+    logarithm: Float[np.ndarray, "i o p wavelength"]  # log(1/sr)
+    usable: Bool[np.ndarray, " i"]  # which incident angles hold values; the first and the last do
+
+
 def between_incident_angles(
-    theta_i: Float[np.ndarray, " i"],
-    theta_o: Float[np.ndarray, " o"],
-    phi_o: Float[np.ndarray, " p"],
-    logarithm: Float[np.ndarray, "i o p wavelength"],
-    usable: Bool[np.ndarray, " i"],
-) -> tuple[Float[np.ndarray, " at_o"], Float[np.ndarray, " at_p"], Float[np.ndarray, "i-1 at_o at_p wavelength"]]:
-    """Return theta_o, phi_o and values midway between equidistant incident angles.
+    known: Rows,
+) -> tuple[Float[np.ndarray, " at_o"], Float[np.ndarray, " at_p"], Float[np.ndarray, "middle at_o at_p wavelength"]]:
+    """Return theta_o and phi_o [rad], and the field there [1/sr] midway between incident angles.
 
     On one path theta_o stays, as does what is broad: a cubic spline through logarithms. On the other it moves with
     theta_i, so that a peak that moves with its mirror direction stays one peak: polynomials through up to six
     logarithms. Of the two, the one that is smoother around a direction counts most. By Helmholtz reciprocity a row
     tells the value at its own angle of all others too: it mends the guess, as far as the rows agree on it.
-
-    Args:
-        theta_i: Equidistant [rad].
-        theta_o: From 0 to pi / 2 [rad].
-        phi_o: From 0 to pi [rad].
-        logarithm: Of the field [log(1/sr)].
-        usable: Which incident angles hold values; the first and the last do.
-
-    Returns:
-        theta_o and phi_o [rad] and the field there [1/sr].
     """
     from scipy.interpolate import CubicSpline, PchipInterpolator
 
+    theta_i, theta_o, phi_o, logarithm, usable = known
     step, middle, number = np.diff(theta_i).mean(), midpoints(theta_i), len(theta_i)
     rows = _on_nodes(theta_i[usable], theta_o)
     inner = theta_o[theta_o + step <= theta_o[-1] + SAME_ANGLE] + step / 2  # both paths meet nodes there
@@ -67,28 +66,21 @@ def between_incident_angles(
     return at_o, at_phi, np.exp(value)
 
 
-def left_out_error(
-    theta_i: Float[np.ndarray, " i"],
-    theta_o: Float[np.ndarray, " o"],
-    phi_o: Float[np.ndarray, " p"],
-    logarithm: Float[np.ndarray, "i o p wavelength"],
-    usable: Bool[np.ndarray, " i"],
-) -> Float[np.ndarray, " i"]:
+def left_out_error(known: Rows) -> Float[np.ndarray, " i"]:
     """Return how far off every second incident angle is, guessed from the others alone: eta of eq. (18); nan else.
 
-    Args are those of `between_incident_angles`. Their step is twice as wide there, so that it is an upper limit.
+    The step is twice as wide there as that of `between_incident_angles`, so that it is an upper limit.
     """
+    theta_i, theta_o, phi_o, logarithm, usable = known
     error = np.full(len(theta_i), np.nan)
     if len(theta_i) < 5 or not usable[::2].all():
         return error
-    at_o, at_phi, guess = between_incident_angles(theta_i[::2], theta_o, phi_o, logarithm[::2], usable[::2])
-    known_o, of_o = np.nonzero(np.abs(theta_o[:, None] - at_o) < SAME_ANGLE)
-    known_p, of_p = np.nonzero(np.abs(phi_o[:, None] - at_phi) < SAME_ANGLE)
-    twins = np.where(np.isclose(phi_o, np.pi), 1.0, 2.0)[known_p, None]
+    every_second = known._replace(theta_i=theta_i[::2], logarithm=logarithm[::2], usable=usable[::2])
+    at_o, _, guess = between_incident_angles(every_second)
+    _, nodes, places = np.intersect1d(theta_o, at_o, return_indices=True)
     left = np.arange(1, 2 * len(guess), 2)
-    wanted = np.exp(logarithm[left][:, known_o][:, :, known_p])
-    off = np.einsum("iopw->i", twins * (guess[:, of_o][:, :, of_p] - wanted) ** 2)
-    error[left] = np.sqrt(off / np.einsum("iopw->i", twins * wanted**2))
+    found, wanted = guess[:, places][:, :, ::2], np.exp(logarithm[left][:, nodes])  # midpoints of phi_o lie between
+    error[left] = node_errors(found, wanted, azimuth_twins(phi_o))
     error[~usable] = np.nan
     return error
 

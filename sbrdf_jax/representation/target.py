@@ -78,6 +78,11 @@ def _given(options: TargetOptions | ErrorBudget) -> tuple[str, float]:
     return next((name, float(value)) for name, value in vars(options).items() if value is not None)
 
 
+def azimuth_twins(phi_o: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+    """Return how many directions of the circle each azimuth of one side stands for: that of the mirror for itself."""
+    return np.where(np.isclose(phi_o, np.pi), 1.0, 2.0)
+
+
 def node_errors(
     found: Float[np.ndarray, "i o p wavelength"], wanted: Float[np.ndarray, "i o p wavelength"], twins
 ) -> Float[np.ndarray, " i"]:
